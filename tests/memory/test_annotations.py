@@ -228,16 +228,6 @@ def described(path, felt=OBSERVED, said=SAID):
     return learner, receipts
 
 
-def test_the_same_twice_is_one_row_and_one_is_not_true(path):
-    with described(path, [])[0] as learner:
-        rows = learner._ledger.store.last
-        learner.describe("b", {"silk": 1})
-        assert learner._ledger.store.last == rows
-        learner.describe("b", {"silk": True})
-        assert learner._ledger.store.last == rows + 1
-        assert learner.descriptions["b"] == {"silk": True}
-
-
 def test_a_compaction_checkpoint_that_all_is_begun_from_again_has_what_was_said_until_then(path):
     learner, _ = described(path)
     learner.compact(keep=4)  # what was said comes behind it
@@ -300,3 +290,7 @@ def test_a_property_has_a_value_and_one_unit_for_all_materials(path, tmp_path):
             learner.merge(other)
         learner.describe("a", {"hardness": (6.2, "MPa")})  # the only one may change its unit
         assert learner.descriptions == {"a": {"hardness": [6.2, "MPa"]}}
+        rows = learner._ledger.store.last
+        for share, more in ((1.0, 1), (1, 1), (True, 2)):  # the same again is no row, and one is not true
+            learner.describe("b", {"silk": share})
+            assert (learner._ledger.store.last, learner.descriptions["b"]) == (rows + more, {"silk": share})

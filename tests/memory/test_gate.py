@@ -4,7 +4,6 @@ Nobody is asked whether a stranger's numbers fit each other; what their files ma
 tests/test_strangers.py.
 """
 
-import math
 import shutil
 from functools import partial
 
@@ -23,7 +22,6 @@ from scroll_tactile_store import DamageError, StoreError
 from touches import PAD, filled, held, stream
 
 from scroll_tactile import Quantity, TactileLearner
-from scroll_tactile.clients.learning.plain_export import export_plain
 from scroll_tactile.errors import EmbeddingError, MismatchError, ScrollTactileError
 from scroll_tactile.memory.gate import check_memory
 from scroll_tactile.memory.touch_rows import pack_readings
@@ -100,7 +98,6 @@ def table(make, values_of):
 
 ROWS = {
     "no attributes": row(attributes={}),
-    "bytes in words": said(nbytes="a"),
     "bytes of others": said(nbytes=488),
     "bytes of none": row({}),
     "another shape": row({"readings-2e0": np.zeros(3, np.int8)}),
@@ -111,7 +108,6 @@ ROWS = {
     "an escape for a name": row(label="\x1b]0;pwned\x07\x1b[2J"),
     "an escape for a source": said(source="\x1b[2J"),
     "a large shape": row(PACKED | {"readings-shape": np.array([2**40, 2])}),
-    "few zeros": row(PACKED | {"readings-zero": np.full(14, 255, np.uint8)}),
     "no rest": row({name: one for name, one in PACKED.items() if name != "readings-rest"}),
     **table(lambda name, value: said(**{name: value}), {"values": [[], {"force": 1.5}], "labels": [[], {"slip": 3}]}),
 }
@@ -188,16 +184,6 @@ def test_what_is_left_out_as_shared_must_be_there(path, tmp_path):
         with pytest.raises(DamageError, match=f"row 1 of {path} .* content hash"):
             learner.merge(path)
         assert held(learner) == before
-
-
-def test_a_time_beyond_the_calendar_is_exported(path, tmp_path):
-    for time in (-1e14, 1e300):
-        touch = validate(stream((int(abs(math.log(abs(time)))), 60)), PAD)
-        row(pack_readings(touch.readings), key=touch.key, time=time)(path)
-    with opened(path, mode="read") as learner:
-        assert [row.time for row in learner.observations()][-2:] == [-1e14, 1e300]
-        export_plain(learner, tmp_path / "plain")
-    assert "-100000000000000.0" in (tmp_path / "plain" / "observations.csv").read_text()
 
 
 def test_what_a_compaction_checkpoint_brings_is_a_row_that_is_looked_at(made, tmp_path):

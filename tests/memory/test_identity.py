@@ -21,10 +21,7 @@ from scroll_tactile.errors import EmbeddingMismatchError, MismatchError
 from scroll_tactile.memory.identity import AbsentEmbedding, Identity
 from scroll_tactile.recipe import Recipe
 
-EMBEDDINGS = {
-    "seeded kernels": lambda: Kernels(dimension=64, seed=3),
-    "joined": lambda: Joined(Kernels(dimension=64), Kernels(dimension=128, seed=1)),
-}
+EMBEDDINGS = [Kernels(dimension=64, seed=3), Joined(Kernels(dimension=64), Kernels(dimension=128, seed=1))]
 
 
 def touch(seed, readings=60):
@@ -38,10 +35,10 @@ def filled(path, **settings):
     return learner
 
 
-@pytest.mark.parametrize("name", EMBEDDINGS)
-def test_a_memory_opens_from_its_path_alone_on_the_command_line_too(name, tmp_path):
+@pytest.mark.parametrize("embedding", EMBEDDINGS, ids=repr)
+def test_a_memory_opens_from_its_path_alone_on_the_command_line_too(embedding, tmp_path):
     path = tmp_path / "m"
-    with filled(path, embedding=EMBEDDINGS[name]()) as learner:
+    with filled(path, embedding=embedding) as learner:
         digest, answer = learner.digest(), learner.predict(touch(9))
     with TactileLearner.open(path) as learner:
         assert (learner.digest(), learner.predict(touch(9))) == (digest, answer)
@@ -52,30 +49,16 @@ def test_a_memory_opens_from_its_path_alone_on_the_command_line_too(name, tmp_pa
     assert json.loads(run("inspect", path, "--json").stdout)["materials"] == {"a": 3, "b": 3, "new": 1}
 
 
-def test_a_network_says_what_is_missing(tmp_path):
-    with TactileLearner.open(tmp_path / "m", sensor=PAD, embedding=Vision(weights=None, seed=0)) as learner:
-        for seed in range(2):
-            learner.observe("ab"[seed], touch(seed))
-        digest = learner.digest()
-    with TactileLearner.open(tmp_path / "m") as learner:  # random weights are made again from their seed
-        assert learner.digest() == digest
-        learner.predict(touch(1))
-
-
-class TestOwnEmbedding:
-    def test_it_is_named_with_what_to_pass(self, tmp_path):
-        filled(tmp_path / "m", embedding=Means()).close()
-        with pytest.raises(EmbeddingMismatchError, match=r"'means' .*pass the one that made it.*embedding="):
-            TactileLearner.open(tmp_path / "m")
-        with TactileLearner.open(tmp_path / "m", embedding=Means()) as learner:
-            assert learner.predict(touch(0)).material == "a"
-
-    def test_what_needs_no_embedding_works_without(self, tmp_path):
-        filled(tmp_path / "m", embedding=Means()).close()
-        assert run("inspect", tmp_path / "m").exit_code == 0
-        assert run("memory", "retract", tmp_path / "m", 1).exit_code == 0
-        np.save(tmp_path / "t.npy", touch(9))
-        assert "pass the one that made it" in refused("predict", tmp_path / "m", tmp_path / "t.npy")
+def test_an_embedding_of_ones_own_is_named_with_what_to_pass_and_not_needed_for_all(tmp_path):
+    filled(tmp_path / "m", embedding=Means()).close()
+    with pytest.raises(EmbeddingMismatchError, match=r"'means' .*pass the one that made it.*embedding="):
+        TactileLearner.open(tmp_path / "m")
+    with TactileLearner.open(tmp_path / "m", embedding=Means()) as learner:
+        assert learner.predict(touch(0)).material == "a"
+    assert run("inspect", tmp_path / "m").exit_code == 0
+    assert run("memory", "retract", tmp_path / "m", 1).exit_code == 0
+    np.save(tmp_path / "t.npy", touch(9))
+    assert "pass the one that made it" in refused("predict", tmp_path / "m", tmp_path / "t.npy")
 
 
 def test_another_embedding_under_the_same_configuration_is_found_out_at_the_first_touch(tmp_path):
@@ -90,7 +73,7 @@ def test_another_embedding_under_the_same_configuration_is_found_out_at_the_firs
 
 
 MADE = [
-    *(make() for make in EMBEDDINGS.values()),
+    *EMBEDDINGS,
     Joined(Kernels(dimension=64), Maps(layout=(3,))),
     Vision(weights=None, seed=0),
     Windowed(dimension=64),

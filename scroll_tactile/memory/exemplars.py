@@ -160,8 +160,7 @@ def rank(candidates: Iterable[Exemplar], count: int, means: Callable[[str, Scale
 def _herded(candidates: list[Exemplar], means: Callable[[str, Scale], Ints], count: int) -> list[Exemplar]:
     widest = max(exemplar.scale for exemplar in candidates)
     wide = [exemplar for exemplar in candidates if exemplar.scale == widest]
-    brief = [exemplar for exemplar in candidates if exemplar.scale != widest]
-    brief.sort(key=lambda exemplar: (-int(exemplar.scale), exemplar.key))
+    brief = sorted((one for one in candidates if one.scale != widest), key=lambda one: (-int(one.scale), one.key))
     codes, keys = np.stack([exemplar.code for exemplar in wide]), [exemplar.key for exemplar in wide]
     order = herd(codes, keys, means(candidates[0].material, widest), count)
     return ([wide[place] for place in order] + brief)[:count]

@@ -37,7 +37,7 @@ OTHER: dict[str, tuple[type[MismatchError], str]] = {  # part of an identity →
     "embedding": (
         EmbeddingMismatchError,
         "Features of one mean nothing to the other: open it with the embedding that made it, take another path, or "
-        "carry the memory over to this one: scroll-tactile memory reembed, or learner.reembed(embedding)",
+        "carry the memory over to this one: scroll-tactile memory reembed {path}, or learner.reembed(embedding)",
     ),
     "reading": OTHER_READING,
     "views": OTHER_READING,
@@ -157,15 +157,15 @@ class Identity(_Kept):
 
     def require_embedding(self, path: Path, embedding: Embedding) -> None:
         """Raise MismatchError for another embedding than the memory's; computing its fingerprint may embed."""
-        self._require(path, {"embedding": EmbeddingIdentity.of(embedding)})
-        self._require(path, _parts_of(window_plan(self.sensor, embedding)))
+        own = {"embedding": EmbeddingIdentity.of(embedding)}
+        self._require(path, own | _parts_of(window_plan(self.sensor, embedding)))
 
     def _require(self, path: Path, parts: Mapping[str, Any]) -> None:
         """Raise MismatchError where the memory was made with another part than one of these."""
         for part, came in parts.items():
             if differing := differences(part, getattr(self, part), came):
                 error, advice = OTHER[part]
-                raise error(f"{path} was made with other values: {differing}. {advice}")
+                raise error(f"{path} was made with other values: {differing}. {advice.format(path=path)}")
 
 
 def differences(part: str, there: Any, here: Any) -> str:
@@ -195,9 +195,8 @@ class AbsentEmbedding:
     """
 
     def __init__(self, identity: Identity, path: Path) -> None:
-        made = identity.embedding
-        self.name, self.dimension, self.bound = made.name, made.dimension, made.bound
-        self.fingerprint = made.fingerprint
+        own = identity.embedding
+        self.name, self.dimension, self.bound, self.fingerprint = own.name, own.dimension, own.bound, own.fingerprint
         self._identity, self._path = identity, path
         partial, judged = identity.reading
         self.capabilities = Capabilities(
@@ -206,7 +205,7 @@ class AbsentEmbedding:
             reads_whole_touches=bool(identity.views),
             embeds_windows=True,
             competes=COMPETING.kind in identity.views,
-            exact=made.bare,
+            exact=own.bare,
         )
 
     @cached_property

@@ -98,7 +98,6 @@ def table(make, values_of):
 
 ROWS = {
     "no attributes": row(attributes={}),
-    "bytes of others": said(nbytes=488),
     "bytes of none": row({}),
     "another shape": row({"readings-2e0": np.zeros(3, np.int8)}),
     "not finite": row(pack_readings(np.full((60, 2), np.nan, np.float32))),

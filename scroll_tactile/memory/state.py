@@ -202,7 +202,7 @@ class Memory:
         self.retractions += 1
         self.weighings.clear()
         self.stale |= any(sample.holds(material, key) for sample in self.samples)
-        if row.sequence <= self.tuned_last_sequence:
+        if row.sequence <= self.tuned_last_sequence <= self.sequence:  # a reader may have one from behind this
             self.tuned = None
         return Changed(material, annotation.labels)
 

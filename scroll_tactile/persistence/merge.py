@@ -136,7 +136,7 @@ class Merge:
         for part in ("sensor", "embedding", "reading", "views", "grid"):
             if differing := differences(part, getattr(other, part), getattr(mine, part)):
                 raise self.refusing(
-                    f"their {part.removesuffix('s')}s differ: {differing}. Merge memories of one sensor and one embedding"
+                    f"their {part.removesuffix('s')}s differ: {differing}. Merge those of one sensor and one embedding"
                 )
         for what, kept in (("exemplars", self._memory.exemplars), ("kept_touches", self._memory.kept)):
             if whole and kept is not None and getattr(mine, what) != getattr(other, what):

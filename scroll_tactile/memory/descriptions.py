@@ -20,7 +20,6 @@ __all__ = [
     "Target",
     "checked",
     "constituents_of",
-    "describe",
     "require_constituents",
     "require_units",
     "targets_of",
@@ -89,14 +88,6 @@ def checked(material: str, constituents: Mapping[str, Any]) -> Description:
         "constituents, or give None for those whose share is unknown",
     )
     return found
-
-
-def describe(descriptions: dict[str, Description], material: str, constituents: Any) -> None:
-    """Keep what a material is made of, in place of its description before; None removes the description."""
-    if constituents is None:
-        descriptions.pop(material, None)
-    else:
-        descriptions[material] = dict(constituents)
 
 
 def constituents_of(description: Description) -> dict[str, float | bool | None]:

@@ -24,18 +24,7 @@ from scroll_tactile.embeddings.registry import require_configuration
 from scroll_tactile.errors import EmbeddingError, InputError, MismatchError
 from scroll_tactile.memory.identity import AbsentEmbedding, Identity
 from scroll_tactile.memory.state import Memory
-from scroll_tactile.memory.touch_rows import (
-    DECLARE,
-    DESCRIBE,
-    KINDS,
-    MEMBER,
-    MERGE,
-    OBSERVE,
-    RowFields,
-    refusing,
-    unpack_codes,
-    unpack_readings,
-)
+from scroll_tactile.memory.touch_rows import Kind, RowFields, refusing, unpack_codes, unpack_readings
 from scroll_tactile.recipe import Recipe, RecipeRequest
 from scroll_tactile.settings import Settings, require_name
 from scroll_tactile.signals.stream import Stream
@@ -44,7 +33,8 @@ from scroll_tactile.statistics.grid import BITS
 
 __all__ = ["MemoryStore", "beside", "check_memory", "finish_interrupted", "open_memory"]
 
-NAMED = (OBSERVE, MEMBER, DECLARE, DESCRIBE)  # rows whose label is a name; that of others may be empty
+KINDS = frozenset(Kind)
+NAMED = (Kind.OBSERVE, Kind.MEMBER, Kind.DECLARE, Kind.DESCRIBE)  # rows whose label is a name, and never empty
 FEWEST = 2**20  # rows that may be retracted at once, and as many as the log has bytes
 R = TypeVar("R", bound=Head)
 
@@ -93,7 +83,7 @@ class MemoryStore(Store):
             if told.sequences:
                 rows, most = (range(first, last + 1) for first, last in told.sequences), max(FEWEST, self._log.size())
                 expect(sum(map(len, rows)) <= most, "sequences", f"at most {most} rows", told.sequences)
-            if isinstance(row, Record) and row.kind == OBSERVE:
+            if isinstance(row, Record) and row.kind == Kind.OBSERVE:
                 self._require_touch(row, told)
         return row
 
@@ -174,7 +164,7 @@ def check_memory(path: str | os.PathLike[str]) -> list[str]:
         for row in chain(compacted, Store.records(store, store.compacted)):
             with _noted(found):
                 store.sound(row)
-                if isinstance(row, Record) and row.kind == MERGE:
+                if isinstance(row, Record) and row.kind == Kind.MERGE:
                     memory.empty_like().fill(row, store.path)
     return found
 

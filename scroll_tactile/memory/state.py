@@ -22,7 +22,6 @@ from scroll_tactile.memory.touch_rows import (
     Encode,
     Readings,
     annotation_of,
-    declaration,
     refusing,
     unpack_codes,
     unpack_readings,
@@ -248,10 +247,6 @@ class Memory:
                 view.kept.add(label, key, replace(kept, material=label, annotation=NO_ANNOTATION))
         return view
 
-    def is_gone(self, sequence: int) -> bool:
-        """Whether this observation was retracted, as far as the memory itself knows."""
-        return sequence in self.retracted
-
     def codes(self, record: Record) -> tuple[int, Codes]:
         """The columns of an observation, and its rows of codes by scale.
 
@@ -321,7 +316,7 @@ class Memory:
                 excluded=gone[gone <= compacted],
                 tuned_last_sequence=self.tuned_last_sequence,
                 descriptions=dict(sorted(self.descriptions.items())),
-                quantities={name: declaration(quantity) for name, quantity in sorted(self.quantities.items())},
+                quantities={name: one.model_dump(exclude={"name"}) for name, one in sorted(self.quantities.items())},
                 corrections=[(row, correction.to_text()) for row, correction in self.corrections.items()],
                 weighings=dict(self.weighings) if weighed else {},
             )

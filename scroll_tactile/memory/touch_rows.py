@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from enum import StrEnum
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, cast
@@ -24,31 +25,16 @@ from scroll_tactile.statistics.fields import Arrays, Name, first_wrong
 from scroll_tactile.statistics.statistics import LONGEST_TOUCH
 
 __all__ = [
-    "ADAPT",
-    "CHANNELS",
-    "CORRECTION",
-    "DECLARE",
-    "DESCRIBE",
-    "KINDS",
-    "LABELS",
-    "MEMBER",
-    "MERGE",
-    "OBSERVE",
-    "RETRACT",
-    "RETRACTS",
-    "SENSE",
-    "SOURCE",
-    "VALUES",
     "Arrays",
     "Changed",
     "Codes",
     "Encode",
+    "Kind",
     "Readings",
     "RowFields",
     "active_rows",
     "annotated",
     "annotation_of",
-    "declaration",
     "declared_by",
     "pack_codes",
     "pack_readings",
@@ -61,19 +47,20 @@ __all__ = [
     "unspanned",
 ]
 
-OBSERVE = "observe"  # a stream was observed; see below
-RETRACT = "retract"  # observations were retracted; the attribute "sequences" holds [first, last] pairs
-MERGE = "merge"  # a compacted memory came in as a whole; the arrays are those of its compaction checkpoint
-MEMBER = "member"  # a stream that such a memory had observed: its name and hash alone
-DESCRIBE = "describe"  # what a material is made of, in the attribute "constituents"; null removes the description
-DECLARE = "declare"  # a quantity that touches can carry: its unit, low, high and resolution; the label is its name
-SENSE = "sense"  # a touch of the material that is its label, or without one the sensor at rest: read, and not learned
-ADAPT = "adapt"  # touches from now on are read through a correction; or an earlier such row counts no more
-SOURCE = "source"  # an attribute of an observation: the file or place it comes from, where `observe` was given one
-VALUES, LABELS = "values", "labels"  # of an observation or a member: quantity → steps, and axis → label, if any
-CHANNELS = "channels"  # of an observation or a sense: numbers of the channels, see `health.channel_numbers`
-CORRECTION, RETRACTS = "correction", "retracts"  # of an adapt: `Correction.to_text`, or the row that is taken back
-KINDS = [OBSERVE, RETRACT, MERGE, MEMBER, DESCRIBE, DECLARE, SENSE, ADAPT]
+
+class Kind(StrEnum):
+    """What a row of the journal says. Its attributes are those of `RowFields`, and what stands in quotes here."""
+
+    OBSERVE = "observe"  # a stream was observed; "channels" are numbers of them, see `health.channel_numbers`
+    RETRACT = "retract"  # observations were retracted
+    MERGE = "merge"  # a compacted memory came in as a whole; the arrays are those of its compaction checkpoint
+    MEMBER = "member"  # a stream that such a memory had observed: its name and hash alone
+    DESCRIBE = "describe"  # what a material is made of, in "constituents"; null removes the description
+    DECLARE = "declare"  # a quantity that touches can carry: "unit", "low", "high", "resolution"; the label names it
+    SENSE = "sense"  # a touch of the material that is its label, or without one the sensor at rest: not learned
+    ADAPT = "adapt"  # touches from now on are read through a "correction"; or the row that it "retracts" counts no more
+    __repr__ = str.__repr__  # in messages it is what a row from the disk says
+
 
 Codes = dict[Scale, npt.NDArray[np.int32]]
 Readings = npt.NDArray[np.float32]
@@ -98,9 +85,10 @@ MANTISSA, LARGEST_EXPONENT = 24, 128  # bits of a float32's mantissa, and its la
 
 
 class RowFields(BaseModel):
-    """What the attributes of a row must be, as far as somebody reads them before its arrays; see the kinds above.
+    """What the attributes of a row must be, as far as somebody reads them before its arrays; see `Kind`.
 
-    columns: of the touch. nbytes: of its readings, where the row has them.
+    columns: of the touch. nbytes: of its readings, where the row has them. source: the file or place it comes from.
+    values, labels: quantity → steps, and axis → label. sequences: what it retracts, as [first, last] pairs.
     """
 
     model_config = ConfigDict(strict=True)
@@ -184,11 +172,6 @@ def unpack_readings(arrays: Arrays) -> Readings | None:
     return None
 
 
-def declaration(quantity: Quantity) -> dict[str, Any]:
-    """The attributes of the row that declares a quantity; its label is the name."""
-    return quantity.model_dump(exclude={"name"})
-
-
 def declared_by(row: Head) -> Quantity:
     """The quantity that a row declares. Raises InputError for what is none."""
     return Quantity(name=row.label, **cast(dict[str, Any], row.attributes))
@@ -196,13 +179,13 @@ def declared_by(row: Head) -> Quantity:
 
 def annotated(annotation: Annotation) -> dict[str, Any]:
     """The attributes of a row with which an annotation is kept: none where there is nothing in it."""
-    found = {VALUES: dict(annotation.values), LABELS: dict(annotation.labels)}
+    found = {"values": dict(annotation.values), "labels": dict(annotation.labels)}
     return {name: told for name, told in found.items() if told}
 
 
 def annotation_of(attributes: Mapping[str, Any]) -> Annotation:
     """The annotation that `annotated` made attributes of."""
-    values, labels = (tuple(sorted(attributes.get(name, {}).items())) for name in (VALUES, LABELS))
+    values, labels = (tuple(sorted(attributes.get(name, {}).items())) for name in ("values", "labels"))
     return Annotation(values, labels)
 
 
@@ -219,14 +202,14 @@ def unpack_codes(arrays: Arrays) -> Codes:
 
 def retracted_by(rows: Iterable[Head]) -> set[int]:
     """The observations that these rows of a journal retracted."""
-    return {row for head in rows if head.kind == RETRACT for row in unspanned(head.attributes["sequences"])}
+    return {row for head in rows if head.kind == Kind.RETRACT for row in unspanned(head.attributes["sequences"])}
 
 
 def active_rows(rows: Iterable[Head]) -> list[Head]:
     """The rows that something was learned from, compacted ones too, without the retracted ones."""
     heads = list(rows)
-    retracted = retracted_by(heads)
-    return [head for head in heads if head.kind in (OBSERVE, MERGE, MEMBER) and head.sequence not in retracted]
+    gone = retracted_by(heads)
+    return [row for row in heads if row.kind in (Kind.OBSERVE, Kind.MERGE, Kind.MEMBER) and row.sequence not in gone]
 
 
 def spans(sequences: Iterable[int]) -> list[list[int]]:

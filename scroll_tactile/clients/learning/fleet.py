@@ -41,7 +41,6 @@ from scroll_tactile.embeddings.protocol import Embedding
 from scroll_tactile.errors import CapacityError, InputError, MismatchError, RangeWarning, ScrollTactileError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.memory.identity import Identity
-from scroll_tactile.memory.touch_rows import SOURCE
 from scroll_tactile.persistence.merge import Choice
 from scroll_tactile.quantities import Quantity, require_declarable
 from scroll_tactile.recipe import Recipe, RecipeRequest
@@ -359,7 +358,7 @@ class _Run:
             path, lambda what, done, of: self._show(f"{what} {done} of {of} touches"), **how
         )
         self._report.repeated += merged.shared
-        self._report.refused += [Refused(str(head.attributes.get(SOURCE, source)), why) for head, why in refused]
+        self._report.refused += [Refused(str(head.attributes.get("source", source)), why) for head, why in refused]
 
     def _note(self, done: Learned) -> None:
         self._report.refused += done.refused

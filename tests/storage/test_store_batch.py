@@ -7,6 +7,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 from scroll_tactile_store import ReadOnlyError, RecordError, Store, StoreError, StoreFullError
+from store_builds import fails
 
 
 @pytest.fixture
@@ -33,33 +34,22 @@ def test_after_an_exception_none_is_there_and_it_comes_out_as_it_is(opened, rais
         add(opened, "one", "two")
         raise raised
     assert caught.value is raised
-    assert labels(opened) == ["before"]
-    assert opened.last == 1
+    assert (labels(opened), opened.last) == (["before"], 1)
     assert add(opened, "after") == [2]
     with opened.batch():
         assert add(opened, "again") == [3]
-    assert labels(opened) == ["before", "after", "again"]
-
-
-def test_a_refused_record_is_not_part_of_a_batch_that_goes_on(opened):
-    with opened.batch():
-        add(opened, "one")
-        with pytest.raises(RecordError):
+        with pytest.raises(RecordError):  # which is not part of it, and it goes on
             opened.append("a", "\0", b"")
-        assert add(opened, "two") == [3]
-    assert labels(opened) == ["before", "one", "two"]
+        assert add(opened, "and again") == [4]
+    assert labels(opened) == ["before", "after", "again", "and again"]
 
 
 @contextmanager
 def full_disk():
     """While it lasts nothing more can be written; the system calls of the log fail."""
-
-    def fail(*_):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
     with pytest.MonkeyPatch.context() as patch:
-        for name in ("write", "fdatasync"):
-            patch.setattr(os, name, fail)
+        for name in ("write", "pwrite", "fdatasync"):
+            patch.setattr(os, name, fails(errno.ENOSPC))
         yield
 
 
@@ -71,8 +61,7 @@ def test_after_a_failed_append_none_is_there_whether_or_not_the_caller_goes_on(o
             opened.append("a", "large", b"", arrays={"x": noise})
         with pytest.raises(StoreError, match="nothing more can be appended"):
             add(opened, "two")
-        assert labels(opened) == ["before"]
-        assert opened.last == 1
+        assert (labels(opened), opened.last) == (["before"], 1)
     with full_disk(), pytest.raises(StoreFullError), opened.batch():
         add(opened, "one")
         opened.append("a", "large", b"", arrays={"x": noise})
@@ -91,29 +80,16 @@ IMPOSSIBLE = {
 }
 
 
-@pytest.mark.parametrize("call", IMPOSSIBLE.values(), ids=IMPOSSIBLE)
-def test_what_a_batch_does_not_allow_is_refused_at_once_and_does_no_harm(opened, call):
-    with opened.batch():
-        add(opened, "one")
-        with pytest.raises(StoreError, match=r"not possible in a batch .*: end it first"):
-            call(opened)
-        add(opened, "two")
-    assert labels(opened) == ["before", "one", "two"]
-    assert opened.latest() is None
-    assert opened.commit(ONE, last_sequence=3) == 1
-
-
-def test_a_batch_and_a_background_commit_do_not_wait_for_each_other_for_ever(opened):
-    for _ in range(5):
-        opened.commit_later(ONE, last_sequence=1)
+def test_what_a_batch_does_not_allow_is_refused_at_once_and_waits_for_nothing(opened):
+    for number, (name, call) in enumerate(IMPOSSIBLE.items(), 2):
+        opened.commit_later(ONE, last_sequence=1)  # which a batch and its calls do not wait for
         with opened.batch():
-            add(opened, "one")
-            with pytest.raises(StoreError, match="end it first"):
-                opened.flush()
+            add(opened, name)
+            with pytest.raises(StoreError, match=r"not possible in a batch .*: end it first"):
+                call(opened)
+        assert opened.last == number
+    assert labels(opened) == ["before", *IMPOSSIBLE]
     opened.flush()
-    assert opened.last == 6
-
-
-def test_a_reader_has_no_batches(opened):
+    assert opened.commit(ONE, last_sequence=3) > 1
     with Store.open(opened.path, mode="read") as reader, pytest.raises(ReadOnlyError), reader.batch():
         pass

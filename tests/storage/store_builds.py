@@ -3,8 +3,6 @@
 import errno
 import os
 import shutil
-import tracemalloc
-from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -119,17 +117,6 @@ def cut_rows(path, first):
 def in_turns(table):
     """The values of a table for `which`: what is done to the plain store, and what to the compacted one."""
     return [(bool(i % 2), *(one if isinstance(one, tuple) else (one,))) for i, one in enumerate(table.values())]
-
-
-@contextmanager
-def taking_at_most(size):
-    """What is done in the block must take no more bytes of memory than this."""
-    tracemalloc.start()
-    try:
-        yield
-        assert tracemalloc.get_traced_memory()[1] < size
-    finally:
-        tracemalloc.stop()
 
 
 def damage(path):

@@ -39,19 +39,20 @@ def keys(path):
 
 
 def looked_through(path, keys, monkeypatch):
-    """Whether all of the log is looked through to find one key's rows; every key finds its own, and nothing else."""
-    with Store.open(path, mode="read") as kept:
-        read, parts = os.read, []
-        with monkeypatch.context() as patch:
-            patch.setattr(os, "read", lambda file, size: parts.append(read(file, size)) or parts[-1])
+    """Whether all of the log is read to find one key's rows; every key finds its own, and nothing else."""
+    read, parts = os.read, []
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "read", lambda file, size: parts.append(size) or read(file, size))
+        with Store.open(path, mode="read") as kept:
             assert sequences(kept.with_key(b"new")) == [n for n in keys if n > 100]
+    with Store.open(path, mode="read") as kept:
         for key in set(keys.values()):
             assert sequences(kept.with_key(key)) == [n for n, own in keys.items() if own == key]
         assert list(kept.with_key(b"never")) == []
         assert [(head.sequence, head.key) for head in kept.heads()] == list(keys.items())
         latest = kept.latest()
         assert latest is None or list(latest.arrays) == ["sum"]
-    return sum(map(len, parts)) > 90 * 88
+    return len(parts) > len(keys)
 
 
 def test_a_row_is_looked_up_without_the_log_being_read_also_in_a_copy_and_a_packed_store(
@@ -67,7 +68,7 @@ def test_a_row_is_looked_up_without_the_log_being_read_also_in_a_copy_and_a_pack
     assert not looked_through(path, keys, monkeypatch)
     with Store.open(path) as kept:
         keys[103] = kept.append("observe", "b", b"new").key
-        kept.compact(SUM, last_sequence=70)
+        kept.compact(SUM, last_sequence=70, newest=(SUM, {}))
     assert not looked_through(path, keys, monkeypatch)
 
 
@@ -86,7 +87,7 @@ def test_without_its_index_a_log_is_read(path, keys, monkeypatch, lost):
         with Store.open(again, mode="read") as opened:
             assert opened.latest().last_sequence == get_current(path)["newest"]["last_sequence"]
         assert {problem.kind for problem in check_store(again)} == {"leftover"}
-    assert looked_through(path, keys, monkeypatch) or lost == "no checkpoint"  # then it was when the store was opened
+    assert looked_through(path, keys, monkeypatch)
 
 
 @pytest.mark.parametrize("mode", ["read", "write"])

@@ -70,22 +70,16 @@ opened.commit_later({"x": numpy.arange(2)}, last_sequence=1)
     assert check_store(tmp_path / "s") == []
 
 
-SURFACES = {
-    "flush": lambda opened: opened.flush(),
-    "commit": lambda opened: opened.commit(ONE, last_sequence=0),
-    "commit_later": lambda opened: opened.commit_later(ONE, last_sequence=0),
-    "close": lambda opened: opened.close(),
-}
-
-
-@pytest.mark.parametrize("surface", SURFACES)
+@pytest.mark.parametrize("surface", ["flush", "commit", "commit_later", "close"])
 def test_a_failure_in_the_background_surfaces_once_and_is_logged(opened, monkeypatch, caplog, surface):
     with monkeypatch.context() as broken:
         broken.setattr(scroll_tactile_store.files, "sync_tree", fails())
         opened.commit_later(ONE, last_sequence=0)
         opened._wait()
     with pytest.raises(StoreError, match="Input/output error"):
-        SURFACES[surface](opened)
+        getattr(opened, surface)(
+            *([ONE] if "commit" in surface else []), **({"last_sequence": 0} if "commit" in surface else {})
+        )
     assert [record.levelno for record in caplog.records] == [logging.ERROR]
     if surface != "close":
         opened.flush()

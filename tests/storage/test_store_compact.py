@@ -149,7 +149,7 @@ def test_a_compaction_that_is_committed_stands_whatever_fails_behind_its_commit(
     monkeypatch.setattr(os, "fsync", fail_once)
     if failing == "the log":
         commit(opened.compact, 16)
-        assert "could not be opened yet" in caplog.text
+        assert [record.levelname for record in caplog.records][:1] == ["WARNING"]
     else:
         with pytest.raises(StoreError, match="Input/output error"):
             commit(opened.compact, 16)

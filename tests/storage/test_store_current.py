@@ -4,7 +4,7 @@ import json
 import shutil
 
 import pytest
-from forging import describe_again, frames_of, get_current, log_of, set_current, write_log
+from forging import describe_again, get_current, log_of, set_current
 from scroll_tactile_store import DamageError, NotAStoreError, Store, VersionError, check_store, repair_store
 from second_reader import digest
 from store_builds import (
@@ -16,7 +16,6 @@ from store_builds import (
     contents,
     damage,
     flip,
-    folders,
     in_turns,
     is_refused,
     newest,
@@ -173,18 +172,3 @@ def test_of_an_empty_store_nothing_is_lost_with_it(tmp_path):
         Store.open(tmp_path, mode="read")
     with Store.open(tmp_path, identity={"a": 2}) as opened:
         assert opened.identity == {"a": 2}
-
-
-@pytest.mark.parametrize("harm", ["an older frame at the end", "a frame that is no row"])
-def test_what_was_never_appended_keeps_all_out(plain, harm):
-    if harm == "a frame that is no row":
-        write_log(plain, [b"no row"])
-    else:
-        frame, data = frames_of(plain)[18], log_of(plain).read_bytes()
-        log_of(plain).write_bytes(data + data[frame.offset : frame.end])
-    is_refused(plain, "repair the store")
-    assert damage(plain)
-    kept = repair_store(plain).kept
-    assert kept == (15 if harm == "a frame that is no row" else LAST)
-    assert folders(plain) == ["00000001"]
-    assert agrees(plain, kept=kept, latest=15, **({} if kept == LAST else {"compacted": 15, "lost": range(1, 16)}))

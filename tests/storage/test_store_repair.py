@@ -12,17 +12,7 @@ from functools import partial
 import pytest
 import scroll_tactile_store.repair
 from forging import frames_of, get_current, log_of, set_current
-from scroll_tactile_store import (
-    DamageError,
-    LockedError,
-    ReadOnlyError,
-    Repair,
-    Store,
-    StoreError,
-    StoreFullError,
-    check_store,
-    repair_store,
-)
+from scroll_tactile_store import DamageError, LockedError, ReadOnlyError, Store, StoreFullError, repair_store
 from scroll_tactile_store.layout import log_path
 from scroll_tactile_store.rows import decode_row, head_without_arrays
 from second_reader import HEAD
@@ -64,7 +54,8 @@ def goes_on(path):
 def test_a_sound_store_is_left_as_it_is(either):
     shutil.copytree(newest(either), either / "checkpoints" / "00000009")
     before = contents(either)
-    assert repair_store(either) == Repair(LAST, [], None)
+    done = repair_store(either)
+    assert (done.kept, done.lost, done.aside) == (LAST, [], None)
     after = contents(either)
     assert {name: after[name] for name in before} == before
     assert after.keys() - before.keys() <= {"lock"}
@@ -100,7 +91,7 @@ def test_a_lost_row_is_found_and_stays_in_its_checkpoint_or_ends_the_store(eithe
     harm(either, row)
     file, number = log_of(either), newest(either).name.lstrip("0")
     said = said.format(row, row + 1)
-    (lost,) = [problem.what for problem in check_store(either) if problem.kind == "lost"]
+    (lost,) = [problem.what for problem in damage(either) if problem.kind == "lost"]
     assert said in lost
     before = file.read_bytes()
     done = repair_store(either)
@@ -231,7 +222,7 @@ def test_without_a_log_all_the_rest_is_checked_and_the_newest_checkpoint_gone_on
     before = contents(either)
     harm(file)
     is_refused(either, re.escape(str(file)), identity={"for": "another"})
-    assert said in " ".join(problem.what for problem in check_store(either))
+    assert said in " ".join(problem.what for problem in damage(either))
     assert contents(either).keys() >= before.keys() - {file.name}
     done = repair_store(either)
     assert done.aside == (file.with_name(f"{file.name}.damaged") if "is gone" not in said else None)
@@ -364,7 +355,7 @@ def test_a_disk_that_does_not_keep_what_is_written_is_told_of(plain, monkeypatch
         flip(path, 400)
 
     before = log_of(plain).read_bytes()
-    with monkeypatch.context() as broken, pytest.raises(StoreError):
+    with monkeypatch.context() as broken, pytest.raises(DamageError):
         broken.setattr(scroll_tactile_store.repair, "create_log", forgetful)
         repair_store(plain)
     assert log_of(plain).read_bytes() == before

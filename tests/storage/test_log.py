@@ -199,6 +199,15 @@ def goes_on(path, rows, damaged, *, exactly):
     assert damage(path) == []
 
 
+def test_a_row_of_another_log_in_the_place_of_one_is_damage(whole, tmp_path):
+    path, other = shutil.copytree(whole.path, tmp_path / "s"), Whole(put_batches(tmp_path / "other"))
+    with Store.open(path, mode="read") as reader:
+        log_of(path).write_bytes(other.data)
+        for sequence in range(1, reader.last + 1):
+            with pytest.raises(DamageError):
+                reader.record(sequence)
+
+
 def test_damage_is_proven_by_a_frame_wherever_it_begins(tmp_path):
     """The search reads in parts: a frame may begin in one and end in the next."""
     path = put_batches(tmp_path / "s", (1, 1), (store_log.PART - 300, 0))

@@ -85,4 +85,4 @@ def test_both_read_a_checkpoint(opened):
 def test_it_reads_nothing_of_the_store():
     lines = Path(second_reader.__file__).read_text().splitlines()
     imports = [line for line in lines if line.startswith(("import", "from"))]
-    assert not any("scroll_tactile" in line for line in imports) and len(lines) <= 175
+    assert not any("scroll_tactile" in line for line in imports) and len(lines) <= 155

@@ -77,9 +77,7 @@ def test_a_failure_in_the_background_surfaces_once_and_is_logged(opened, monkeyp
         opened.commit_later(ONE, last_sequence=0)
         opened._wait()
     with pytest.raises(StoreError, match="Input/output error"):
-        getattr(opened, surface)(
-            *([ONE] if "commit" in surface else []), **({"last_sequence": 0} if "commit" in surface else {})
-        )
+        getattr(opened, surface)(**({"arrays": ONE, "last_sequence": 0} if "commit" in surface else {}))
     assert [record.levelno for record in caplog.records] == [logging.ERROR]
     if surface != "close":
         opened.flush()

@@ -3,6 +3,7 @@
 import random
 import shutil
 import tempfile
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -59,15 +60,13 @@ class History(RuleBasedStateMachine):
     @rule(several=several, undone=st.booleans())
     def batch(self, several, undone):
         before = list(self.rows)
-        try:
-            with self.store.batch():
-                for label, array in several:
-                    self.put(label, array)
-                assert self.store.last == len(self.rows)
-                if undone:
-                    raise Undone
-        except Undone:
-            self.rows = before
+        with suppress(Undone), self.store.batch():
+            for label, array in several:
+                self.put(label, array)
+            assert self.store.last == len(self.rows)
+            if undone:
+                self.rows = before
+                raise Undone
 
     def numbered(self, last_sequence, array):
         """A checkpoint has the number behind those that are kept."""

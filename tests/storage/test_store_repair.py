@@ -129,15 +129,6 @@ def test_a_lost_head_of_a_compacted_row_is_left_out_and_no_more(compacted):
     assert goes_on(compacted)
 
 
-@pytest.mark.parametrize("first", [2, 11, 15, 18])
-def test_a_log_that_was_cut_off_gives_what_it_still_has(plain, first):
-    cut_rows(plain, first)
-    kept, at = max(15, first - 1), 15 if first <= 15 else 0
-    assert repair_store(plain).kept == kept
-    assert agrees(plain, kept=kept, compacted=at, latest=15, lost=range(first, 16))
-    assert goes_on(plain)
-
-
 def test_a_torn_end_is_no_damage_and_is_in_no_repair(plain, tmp_path):
     with Store.open(plain) as opened:
         for number in range(21, 25):
@@ -172,22 +163,26 @@ def test_whole_pages_of_rubbish_are_found_and_what_is_left_is_as_it_was(either, 
 # Checkpoints and logs.
 
 CHECKPOINTS = {
-    # compacted, checkpoints spoilt, rows lost: kept, compacted, latest, what is said of rows
-    "the newest": ((False, [newest], []), (LAST, 0, None, [])),
-    "the newest, and rows": ((False, [newest], [4, 12]), (3, 0, None, ["rows 4 to 20 are dropped"])),
-    "the compaction checkpoint": (
-        (True, [compaction], []),
-        (LAST, 15, 15, ["rows 1 to 15 give up their arrays, checkpoint 2 stands for"]),
-    ),
-    "the newest beside a compaction checkpoint": ((True, [newest], []), (LAST, 6, 6, [])),
-    "both": ((True, [newest, compaction], []), (0, 0, None, ["rows 1 to 20 are dropped"])),
+    # checkpoints spoilt, rows lost; kept, compacted, latest, what is said of rows
+    "the newest": ([newest], [], LAST, 0, None, []),
+    "the newest of two": ([newest], [], LAST, 6, 6, []),
+    "the newest, and rows": ([newest], [4, 12], 3, 0, None, ["rows 4 to 20 are dropped"]),
+    "that of the compaction": ([compaction], [], LAST, 15, 15, ["rows 1 to 15 give up their arrays, checkpoint 2"]),
+    "rows alone": ([], [4, 12], LAST, 15, 15, ["row 4 has arrays", "row 12 has arrays", "rows 1 to 15 give up"]),
+    "both": ([newest, compaction], [], 0, 0, None, ["rows 1 to 20 are dropped"]),
 }
 
 
-@pytest.mark.parametrize(("harm", "expected"), CHECKPOINTS.values(), ids=CHECKPOINTS)
-def test_damaged_checkpoints_are_put_aside_and_the_next_best_gone_on_from(stores, tmp_path, harm, expected):
-    (is_compacted, spoilt, lost), (kept, last_sequence, latest, said) = harm, expected
-    path = shutil.copytree(stores[is_compacted], tmp_path / "s")
+@pytest.mark.parametrize(
+    ("which", "spoilt", "lost", "kept", "last_sequence", "latest", "said"),
+    in_turns(CHECKPOINTS),
+    ids=CHECKPOINTS,
+    indirect=["which"],
+)
+def test_damaged_checkpoints_are_put_aside_and_the_next_best_gone_on_from(
+    either, spoilt, lost, kept, last_sequence, latest, said
+):
+    path = either
     for number in lost:
         flip_row(path, number, arrays=True)
     spoilt, log = [choose(path) for choose in spoilt], log_of(path)

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scroll_tactile_store import Head, Record, RecordError, Store, checkpoint_files, encoding, records
-from store_builds import damage, newest, sequences
+from store_builds import damage, newest, same_arrays, sequences
 
 DTYPES = ["|i1", "|u1", "<i2", "<i4", "<i8", "<u2", "<u4", "<u8", "<f2", "<f4", "<f8"]
 arrays = st.dictionaries(
@@ -35,12 +35,8 @@ attributes = st.dictionaries(texts, values, max_size=3)
 
 
 def same(found, given):
-    assert list(found) == list(given)
-    for name, array in given.items():
-        assert (found[name].dtype, found[name].shape) == (array.dtype, array.shape)
-        assert found[name].tobytes() == array.tobytes()
-        assert found[name].flags.writeable
-    return True
+    assert same_arrays(found, given)
+    return list(found) == list(given) and all(array.flags.writeable for array in found.values())
 
 
 @pytest.fixture(scope="module")

@@ -7,19 +7,7 @@ import pytest
 from forging import describe_again, get_current, log_of, set_current
 from scroll_tactile_store import DamageError, NotAStoreError, Store, VersionError, check_store, repair_store
 from second_reader import digest
-from store_builds import (
-    IDENTITY,
-    LAST,
-    add,
-    agrees,
-    commit,
-    contents,
-    damage,
-    flip,
-    in_turns,
-    is_refused,
-    newest,
-)
+from store_builds import IDENTITY, LAST, add, agrees, commit, contents, damage, flip, in_turns, is_refused, newest
 
 HARMS = {
     "gone": lambda file: file.unlink(),

@@ -104,8 +104,11 @@ def test_exchanged_and_doubled_rows_are_found(plain, row):
     for change in (swap, double):
         path = shutil.copytree(plain, plain.with_name(change.__name__))
         change_rows(path, change)
-        with pytest.raises(DamageError, match="repair"), Store.open(path, mode="read") as opened:
-            list(opened.heads())
+        if row > 15:  # behind the checkpoint
+            is_refused(path)
+        else:
+            with pytest.raises(DamageError, match="repair"), Store.open(path, mode="read") as opened:
+                list(opened.heads())
 
 
 def test_missing_rows_are_named_and_their_numbers_not_given_again(plain):

@@ -56,12 +56,10 @@ def logged(number=1, identity=None):
 CURRENTS = {  # what it says in place of what it said; all but the last are about numbers and texts that nobody wrote
     "no log": lambda known: {"log": None},
     "a log in words": logged("../../log"),
-    "a format below 0": lambda known: {"format": -1},
     "a text for a checkpoint": lambda known: {"newest": "x"},
     "a checkpoint without a place": named(place=None),
     "a last row in words": named(last_sequence="15"),
     "a number above any": named(number=2**64),
-    "a sha256 in capitals": named(sha256="AB" * 32),
     "a compaction checkpoint without a newest": lambda known: {"newest": None, "compaction": known["newest"]},
     "a compaction checkpoint newer than the newest": lambda known: {
         "compaction": known["newest"] | {"last_sequence": 16}

@@ -292,11 +292,12 @@ def test_room_is_made_ahead_without_holes_and_given_back(opened):
     assert path.stat().st_size == Whole(opened.path).commits[-1]
 
 
-def test_what_is_left_of_a_nearly_full_disk_is_for_others(small_disk):
+def test_where_there_is_no_room_ahead_a_row_alone_is_written(small_disk):
     with Store.open(small_disk / "s", identity={}) as opened:
-        put(opened)
-        assert log_of(opened.path).stat().st_size < 1000
-        (small_disk / "other").write_bytes(bytes(500_000))
+        (small_disk / "other").write_bytes(bytes(shutil.disk_usage(small_disk).free - 5 * 4096))
+        assert [put(opened).sequence, put(opened).sequence] == [1, 2]
+        assert log_of(opened.path).stat().st_size < 2**17
+    assert damage(small_disk / "s") == []
 
 
 def test_short_writes_are_gone_on_with(opened, monkeypatch):

@@ -40,7 +40,7 @@ def test_after_an_exception_none_is_there_and_it_comes_out_as_it_is(opened, rais
     with opened.batch():
         assert add(opened, "again") == [3]
         with pytest.raises(RecordError):  # which is not part of it, and it goes on
-            opened.append("a", "\0", b"")
+            opened.append("a", 5, b"")
         assert add(opened, "and again") == [4]
     assert labels(opened) == ["before", "after", "again", "and again"]
 

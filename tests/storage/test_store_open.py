@@ -79,7 +79,7 @@ def test_where_there_are_no_locks_that_is_said_and_no_other_kind_is_taken(tmp_pa
     before = contents(tmp_path / "s")
     monkeypatch.setattr(fcntl, "flock", fails(code))
     for path in (tmp_path / "s", tmp_path / "new"):
-        with pytest.raises(StoreError, match="has no locks") as caught:
+        with pytest.raises(StoreError, match="without which two writers could spoil") as caught:
             Store.open(path, identity={})
         assert not isinstance(caught.value, LockedError)
         assert str(path) in str(caught.value)

@@ -99,14 +99,13 @@ def test_awkward_arrays_come_back_in_both_places_and_bombs_are_written_as_they_a
     assert sorted(chunk.name for chunk in (newest(kept.path) / "in_chunks" / "c").iterdir()) == ["0", "1", "2"]
 
 
-NAN = {"a": [1, float("nan")]}
 REFUSED = {
     "label with NUL": {"label": "a\0b"},
     "label not text": {"label": 3},
     "key too long": {"key": bytes(65)},
     "key not bytes": {"key": "text"},
     "time not a number": {"time": float("nan")},
-    r"attributes\['a'\]\[1\] is nan": {"attributes": NAN},
+    "attribute NaN": {"attributes": {"a": [1, float("nan")]}},
     "attribute of NumPy": {"attributes": {"a": np.int64(1)}},
     "attribute key": {"attributes": {"a": {1: 2}}},
     "attributes of more values than are read": {"attributes": {"many": [0] * 2**10}},
@@ -130,7 +129,7 @@ REFUSED = {
 def test_what_cannot_be_kept_is_refused_and_nothing_changes(kept, said, wrong, monkeypatch):
     monkeypatch.setattr(records, "MOST_VALUES", 2**10)
     monkeypatch.setattr(records, "LARGEST_JSON", 2**14)
-    before, match = kept.state(), said if "must" in said or "is nan" in said or "called" in said else None
+    before, match = kept.state(), said if "must" in said or "called" in said else None
     if "last_sequence" not in wrong:
         with pytest.raises(RecordError, match=match) as caught:
             kept.append(**({"kind": "a", "label": "b", "key": b""} | wrong))

@@ -60,10 +60,6 @@ CURRENTS = {  # what it says in place of what it said; all but the last are abou
     "a checkpoint without a place": named(place=None),
     "a last row in words": named(last_sequence="15"),
     "a number above any": named(number=2**64),
-    "a compaction checkpoint without a newest": lambda known: {"newest": None, "compaction": known["newest"]},
-    "a compaction checkpoint newer than the newest": lambda known: {
-        "compaction": known["newest"] | {"last_sequence": 16}
-    },
     "a log that is not there": logged(7),
     "a log of the last number": logged(2**63 - 1),
     "a log of another identity": logged(1, "00" * 8),

@@ -71,14 +71,17 @@ def test_a_damaged_row_keeps_all_from_being_given_up(opened, row, arrays):
             assert holds(again, compacted=7, latest=LAST)
 
 
-@pytest.mark.parametrize("name", ["create_log", "write_checkpoint"])
-def test_what_was_written_is_read_back_before_it_counts(opened, monkeypatch, name):
+@pytest.mark.parametrize("harm", ["a bit of the log", "the end of the log", "a bit of a checkpoint"])
+def test_what_was_written_is_read_back_before_it_counts(opened, monkeypatch, harm):
+    name = "create_log" if "log" in harm else "write_checkpoint"
     real = getattr(scroll_tactile_store.store, name)
 
     def forgetful(path, number, *rest):
         done = real(path, number, *rest)
-        if name == "create_log":
+        if harm == "a bit of the log":
             flip(path, 500)
+        elif harm == "the end of the log":
+            os.truncate(path, path.stat().st_size - 20)
         else:
             spoil(path / "checkpoints" / f"{number:08d}")
         return done

@@ -159,7 +159,7 @@ def test_the_same_quantity_again_is_no_row_and_another_is_refused(tmp_path):
         ({"values": [("force", 1.0)]}, "values as a mapping by name; came list"),
         ({"labels": {"slip": ""}}, "axes and labels as materials' names are: expected a name of 1 to 200"),
         ({"labels": {"slip": 3}}, "came int 3"),
-        ({"labels": {"a\n": "x"}}, "printable"),
+        ({"labels": {"a\nb": "x"}}, "printable"),
         ({"labels": {str(i): "x" for i in range(17)}}, "at most 16 axes; came 17"),
         ({"labels": {str(i): "x" for i in range(16)}}, "at most 16 axes; came .*'slip'"),
         ({"values": {"force": 2.5}}, r"observation 4 has this touch of 'b' with values \{'force': 0.33\} and labels"),

@@ -125,11 +125,13 @@ def learn(
     if executor is not None and not isinstance(executor, Executor):
         raise InputError(f"expected an Executor, such as client.get_executor() of Dask; came {type(executor).__name__}")
     begun, place = time.perf_counter(), Path(memory).absolute()
-    found, missing = find_sources([os.fspath(source) for source in sources])
+    paths = [os.fspath(source) for source in sources]
+    found, missing = find_sources(paths)
+    options = (options or SourceOptions()).among(found, paths)
     report = FleetReport(sources=len(found), refused=missing)
     asked = RecipeRequest.of(sensor, embedding, {"exemplars": exemplars, "kept_touches": kept_touches})
     with _opened(place, asked) as learner:
-        run = _Run(learner, options or SourceOptions(), descriptions, report, progress)
+        run = _Run(learner, options, descriptions, report, progress)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RangeWarning)  # it is said at the end
             if executor is None and workers == 1:

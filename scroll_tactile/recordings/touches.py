@@ -66,7 +66,7 @@ class Touch:
 
 
 Cut = Literal["whole", "episodes"] | Sequence[Interval] | Callable[[Recording], Iterable[tuple[int, int]]]
-Label = Literal["topic", "file", "folder", "task"] | None
+Label = str | None
 
 
 def touches(recording: Recording, cut: Cut = "whole", label: Label = None) -> tuple[Touch, ...]:

@@ -107,7 +107,7 @@ def observe(
         values = {name: float(number) for name, number in _noted("value", value).items()}
     except ValueError as error:
         raise InputError(f"expected --value as a name and a number, such as force=1.4: {error}") from None
-    options, chosen = how.options(cut="none", material=material), sensor_for(memory, sensor, how.preset)
+    options, chosen = how.taken(cut="none", material=material), sensor_for(memory, sensor, how.preset)
     if chosen is not None and not memory.exists():
         options = options.by_names([str(file)], chosen)
         chosen = chosen.model_copy(update={"columns": tuple(options.names) or None})
@@ -170,7 +170,7 @@ def predict(
     from scroll_tactile.clients.learning.learning import answers
     from scroll_tactile.clients.learning.sources import find_sources
 
-    options = how.options()
+    options = how.taken()
     found, refused = find_sources(sources)
     alone = len(sources) == 1 and len(found) + len(refused) == 1 and not as_csv
     with opened(memory, mode="read") as learner:

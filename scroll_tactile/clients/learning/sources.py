@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise
-from pathlib import Path
-from typing import Literal
+from pathlib import Path, PurePosixPath
+from typing import Any, Literal, Self
 
 import numpy as np
 from scroll_tactile_store.archive import ARCHIVE_BYTES, is_archive
@@ -23,6 +24,7 @@ from scroll_tactile.recordings import Interval, Recording, Touch, find, iterate,
 from scroll_tactile.recordings.headings import Heading, Noted, noted_in
 from scroll_tactile.recordings.locations import file_system, is_remote
 from scroll_tactile.recordings.recording import in_order, require_columns
+from scroll_tactile.recordings.touches import require_found
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.settings import LONGEST_SOURCE, require_name
 from scroll_tactile.signals.facts import Fact
@@ -47,6 +49,9 @@ WHOLE = ("metadata.yaml", "meta/info.json", ".zgroup", "zarr.json")  # in a fold
 
 Cut = Literal["episodes", "intervals", "none", "contact"]
 
+_FOLDER = re.compile(r"folder:(\d{1,4})", re.ASCII)
+_BY = ("topic", "file", "folder", "task")
+
 
 @dataclass(frozen=True)
 class SourceOptions:
@@ -54,9 +59,10 @@ class SourceOptions:
 
     topic, field, clock, columns, preset, labels, annotate: as of `recordings.read`. cut: None cuts by the intervals
     where there are some, by episodes where a recording has some, and not otherwise.
-    material: the name of all touches. by: what names each touch, as of `recordings.touches`. intervals: the table's.
-    At most one of the three names them; without any, episodes name themselves. quantities: that are declared before
-    anything is learned, as the table's headings do (`recordings.declared_quantities`), beside those of `annotate`.
+    material: the name of all touches. by: what names each touch, as of `recordings.touches`, or "folder:2", the second
+    folder below one of `tops`, see `among`. intervals: the table's. At most one of the three names them; without any,
+    episodes name themselves. quantities: that are declared before anything is learned, as the table's headings do
+    (`recordings.declared_quantities`), beside those of `annotate`.
     rate: what becomes of a recording that has another rate than the sensor by its times: "keep" takes its numbers as
     they are, whatever its times say, "resample" a reading each step of the sensor's; unless given it is refused where
     they differ by a fifth or more.
@@ -77,18 +83,23 @@ class SourceOptions:
     annotate: Sequence[str] = ()
     cut: Cut | None = None
     material: str | None = None
-    by: Literal["topic", "file", "folder", "task"] | None = None
+    by: str | None = None
     intervals: Sequence[Interval] | None = None
     quantities: Sequence[Quantity] = ()
     rate: Literal["keep", "resample"] | None = None
     names: Sequence[str] = ()
     names_of: str = ""
+    tops: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if sum(given is not None for given in (self.material, self.by, self.intervals)) > 1:
             raise InputError(
                 "touches can be named in one way: by one of material=, by= and intervals=",
                 argument="material by intervals",
+            )
+        if self.by is not None and self.by not in _BY and _FOLDER.fullmatch(self.by) is None:
+            raise InputError(
+                f"expected by={', '.join(map(repr, _BY))} or 'folder:2'; came {self.by!r:.60}", argument="by"
             )
         if self.material is not None:
             require_name(self.material)
@@ -111,6 +122,45 @@ class SourceOptions:
                 f"expected each quantity and axis once in annotate=; came {twice[0]!r} several times",
                 argument="annotate",
             )
+
+    def among(self, sources: Sequence[str], paths: Sequence[str]) -> Self:
+        """These options for the sources that were found in some paths, below which "folder:2" counts.
+
+        Raises InputError for an interval whose file is none of the sources, or several, and for by="folder" where
+        folders name no materials: they are numbers alone, or one name lies in several folders.
+        """
+        files = [source for source in sources if not is_memory(source)]
+        require_found(self.intervals or (), files)
+        placed = replace(self, tops=tuple(paths))
+        if self.by == "folder":
+            placed._require_folders([placed.folders(source) for source in files])
+        return placed
+
+    def folders(self, source: str) -> list[str]:
+        """The folders from the path that was typed down to a source; those in its path where it was typed itself."""
+        own = _parts(source)[:-1]
+        tops = (_parts(top) for top in self.tops)
+        below = own[max((len(top) for top in tops if own[: len(top)] == top), default=0) :]
+        return below or own[-1:]
+
+    def _require_folders(self, found: Sequence[list[str]]) -> None:
+        above: dict[str, set[tuple[str, ...]]] = {}
+        for folders in filter(None, found):
+            above.setdefault(folders[-1], set()).add(tuple(folders[:-1]))
+        numbers = [name for name in above if not any(map(str.isalpha, name))]
+        several = [name for name, places in above.items() if len(places) > 1]
+        if not numbers and not several:
+            return
+        why = f"{numbers[0]!r} is a number" if numbers else f"{several[0]!r} lies in several folders"
+        levels = []
+        for level in range(1, max(map(len, found)) + 1):
+            names = list(dict.fromkeys(folders[level - 1] for folders in found if len(folders) >= level))
+            levels.append(f"by='folder:{level}' for {', '.join(names[:3])}{' …' if len(names) > 3 else ''}")
+        raise InputError(
+            f"by='folder' would take a folder for a material that is none: {why}. Say which folder names the material: "
+            f"{'; '.join(levels)}",
+            argument="by",
+        )
 
     @property
     def declared(self) -> list[Quantity]:
@@ -165,13 +215,23 @@ class SourceOptions:
         """
         if self.intervals is not None:
             found = touches(recording, self.intervals)
-        elif self.cut == "contact":
-            found = touches(recording, partial(_contacts, learner), self.by)
         else:
             whole = self.cut == "none" or (self.cut is None and not recording.episodes)
-            found = touches(recording, "whole" if whole else "episodes", self.by)
+            cut: Any = partial(_contacts, learner) if self.cut == "contact" else "whole" if whole else "episodes"
+            found = touches(recording, cut, None if (level := _FOLDER.fullmatch(self.by or "")) else self.by)
+            if level:
+                name = self._folder(recording.source, int(level[1]))
+                found = tuple(replace(touch, material=name) for touch in found)
         breaks = [] if self.rate == "keep" else recording.breaks(learner.sensor)
         return tuple(piece for touch in found for piece in _pieces(touch, breaks, learner.sensor))
+
+    def _folder(self, source: str, level: int) -> str:
+        """The name of a folder above a source, counted from the path that was typed. Raises InputError for none."""
+        folders = self.folders(source)
+        if not 0 < level <= len(folders):
+            there = ", ".join(f"by='folder:{i + 1}', {name}" for i, name in enumerate(folders))
+            raise InputError(f"it has no folder {level}; expected {there or 'by=file'}", argument="by")
+        return folders[level - 1]
 
 
 def _pieces(touch: Touch, breaks: Sequence[int], sensor: Sensor) -> Iterator[Touch | Refused]:
@@ -206,6 +266,12 @@ def _contacts(learner: TactileLearner, recording: Recording) -> list[tuple[int, 
             argument="cut",
         )
     return spans
+
+
+def _parts(address: str) -> list[str]:
+    """The parts of a path or an address, without what stands for this folder or the root."""
+    path = PurePosixPath(address.partition("://")[2] if is_remote(address) else Path(address).as_posix())
+    return [part for part in path.parts if part not in ("/", "..", ".")]
 
 
 @dataclass(frozen=True)

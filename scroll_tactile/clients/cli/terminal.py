@@ -86,6 +86,9 @@ class Reading:
     field: Annotated[str | None, Option(help="The path to the numbers, such as 'tactiles[0].electrodes'.")] = None
     clock: Annotated[str | None, Option(help="device, header, publish or log; or a field, column or array.")] = None
     columns: Columns = None
+    definitions: Annotated[
+        Path | None, Option(help="A folder of .msg files, for a bag that does not define its messages.")
+    ] = None
 
 
 @dataclass(frozen=True)
@@ -114,9 +117,11 @@ class Named(Reading):
         """How these recordings are read, cut and named. Raises InputError for options that do not fit together."""
         from scroll_tactile.clients.learning.sources import SourceOptions
         from scroll_tactile.recordings import declared_quantities, read_intervals
+        from scroll_tactile.recordings.decoding import definitions_of
 
         given = {name: getattr(value, "value", value) for name, value in vars(self).items() if value is not None}
         given["annotate"] = tuple(given.get("annotate", ()))
+        given["definitions"] = definitions_of(self.definitions)
         if self.intervals is not None:
             if self.labels is not None:
                 raise InputError("give --labels or --label-topic: both say where touches begin")

@@ -81,7 +81,7 @@ class Scan:
         elif name.endswith(".db3"):
             yield from _scan_db3(self)
         else:
-            yield from _scan_bag(self) if name.endswith(".bag") else _scan_mcap(self)
+            yield from (_Bag if name.endswith(".bag") else _Mcap)(self).scanned()
 
     def opened(self, begin: bytes) -> BinaryIO:
         """The file behind these bytes, with which it has to begin."""
@@ -139,144 +139,96 @@ def _unzipped(scan: Scan, folder: Path) -> Path:
     return target
 
 
-# ROS 1: records have a header of fields and data; chunks hold records. rosbags knows what is in them.
+# MCAP and ROS 1: records after records; chunks hold records.
 
-_BAG = b"#ROSBAG V2.0\n"
-_MESSAGE, _CHUNK, _CONNECTION = 2, 5, 7
-
-
-def _scan_bag(scan: Scan) -> Iterator[Message]:
-    with optional("rosbags", "ros", "a ROS recording"):
-        from rosbags.rosbag1.reader import Header, Reader, ReaderError, read_uint32
-    bag, channels = Reader(scan.path), dict[int, Channel]()
-    with scan.opened(_BAG) as bag.bio:
-        file = bag.bio
-        try:
-            header, length = Header.read(file), read_uint32(file)
-            begin, index = file.tell() + length, header.get_uint64("index_pos")
-            scan.cut_off = None if index else "its recorder did not close it"
-            with suppress(Exception):  # of an index that is not there: what is in it is in the chunks, too
-                file.seek(index or scan.size)
-                for _ in range(header.get_uint32("conn_count")):
-                    _connect(bag, channels)
-            file.seek(begin)
-            while file.tell() < scan.size:
-                header, length = Header.read(file), read_uint32(file)
-                left = scan.size - file.tell()
-                if header.get_uint8("op") == _CHUNK:
-                    yield from _in_chunk(bag, channels, file.read(length), scan, whole=length <= left)
-                else:
-                    file.seek(length, os.SEEK_CUR)
-                if length > left:
-                    raise ReaderError("it ends in the middle of a record")
-        except ReaderError as error:
-            scan.cut_off = str(error)
-
-
-def _connect(bag: Any, channels: dict[int, Channel]) -> None:
-    each = bag.read_connection()
-    channels[each.id] = Channel(each.topic, each.msgtype, "ros1", each.msgdef.data)
-
-
-def _in_chunk(bag: Any, channels: dict[int, Channel], data: bytes, scan: Scan, *, whole: bool) -> Iterator[Message]:
-    """The messages of a chunk; of one that was cut off, those before the cut."""
-    from rosbags.rosbag1.reader import Header, read_bytes, read_uint32
-
-    file = bag.bio
-    try:
-        bag.bio = chunk = BytesIO(inside := inflated(data, scan.room))
-        while (begin := chunk.tell()) < len(inside):
-            header, length = Header.read(chunk), read_uint32(chunk)
-            kind, end = header.get_uint8("op"), chunk.tell() + length
-            if kind == _CONNECTION:
-                chunk.seek(begin)
-                _connect(bag, channels)
-            elif kind == _MESSAGE:
-                channel = channels.get(header.get_uint32("conn"))
-                if channel is not None and scan.wanted(channel.topic):
-                    yield Message(channel, header.get_time("time"), None, None, 0, read_bytes(chunk, length))
-            chunk.seek(end)
-    except InputError:  # a library is missing, or the chunk claims too much
-        raise
-    except Exception:  # whatever damage does to decompressors and parsers
-        scan.damaged += whole
-    finally:
-        bag.bio = file
-
-
-# MCAP: records have a kind, a length and data; chunks hold records.
-
-_MAGIC = b"\x89MCAP0\r\n"
-_FOOTER, _SCHEMA, _CHANNEL, _MCAP_MESSAGE, _MCAP_CHUNK, _DATA_END = 2, 3, 4, 5, 6, 15
-_HEAD, _MCAP_HEAD, _CHUNK_HEAD = struct.Struct("<BQ"), struct.Struct("<HIQQ"), struct.Struct("<QQQI")
-
-
-def _scan_mcap(scan: Scan) -> Iterator[Message]:
-    reader = _Mcap(scan)
-    with scan.opened(_MAGIC) as file:
-        # Schemas and channels stand at a whole file's end again: those in a damaged chunk are needed by later ones.
-        file.seek(max(scan.size - 37, 0))
-        if (footer := file.read()).endswith(_MAGIC) and footer[0] == _FOOTER:
-            file.seek(int.from_bytes(footer[9:17], "little") or scan.size)
-            for _ in reader.records(file):
-                pass
-        file.seek(len(_MAGIC))
-        if not (yield from reader.records(file)):
-            scan.cut_off = "it ends before its end, or in the middle of a record"
+_HEAD, _MESSAGE, _CHUNK = struct.Struct("<BQ"), struct.Struct("<HIQQ"), struct.Struct("<QQQI")
 
 
 class _Mcap:
-    """Follows the schemas and channels of an MCAP file from record to record."""
+    """Walks from record to record, in a file and in its chunks: a kind, a length, and data. `_Bag` does so in ROS 1's.
+
+    closed: whether the file was closed by its recorder.
+    """
+
+    begin, chunk, kinds = b"\x89MCAP0\r\n", 6, (3, 4, 5)  # schemas, channels and messages
 
     def __init__(self, scan: Scan) -> None:
-        self.scan = scan
-        self.schemas: dict[int, tuple[str, str, str]] = {}
+        self.scan, self.closed, self.total = scan, False, 0
         self.channels: dict[int, Channel] = {}
-        self.others: dict[int, int] = {}
-        self.total = 0
+        self.schemas: dict[int, tuple[str, str, str]] = {}
+        self.seen: dict[int, int] = {}
 
-    def records(self, file: BinaryIO) -> Generator[Message, None, bool]:
-        """The messages from here on; returns whether they end with an end."""
-        while len(head := file.read(_HEAD.size)) == _HEAD.size:
-            kind, length = _HEAD.unpack(head)
-            if kind in (_FOOTER, _DATA_END):
-                return True
-            most = min(length, self.scan.room)
-            if kind not in (_SCHEMA, _CHANNEL, _MCAP_MESSAGE, _MCAP_CHUNK):
-                file.seek(most, os.SEEK_CUR)
+    def scanned(self) -> Iterator[Message]:
+        """The messages of the file."""
+        with self.scan.opened(self.begin) as file:
+            if index := self.index(file):  # a damaged chunk may hold channels that are needed by later ones
+                file.seek(index)
+                for _ in self.messages(file):
+                    pass
+            file.seek(len(self.begin))
+            whole = yield from self.messages(file)
+            if not (whole and self.closed):
+                self.scan.cut_off = "its recorder did not close it" if whole else "it ends in the middle of a record"
+
+    def messages(self, file: BinaryIO) -> Generator[Message, None, bool]:
+        """Those from here on; returns whether the last record is whole."""
+        while (found := self.head(file)) is not None:
+            kind, header, length = found
+            if kind != self.chunk and kind not in self.kinds:
+                file.seek(min(length, self.scan.room), os.SEEK_CUR)
                 continue
-            data = file.read(most)
-            if kind == _MCAP_CHUNK:
-                yield from self._chunk(data, whole=len(data) == length)
-            elif len(data) == length and (message := self._record(kind, data)) is not None:
+            data = file.read(min(length, self.scan.room))
+            whole = len(data) == length
+            if kind == self.chunk:
+                try:
+                    yield from self.messages(BytesIO(self.inside(data, whole=whole)))
+                except InputError:  # a library is missing, or the chunk claims too much
+                    raise
+                except Exception:  # whatever damage does to decompressors and parsers
+                    self.scan.damaged += whole
+            elif whole and (message := self.record(kind, header, data)) is not None:
                 yield message
-        return False
+            if not whole:
+                return False
+        return True
 
-    def _chunk(self, data: bytes, *, whole: bool) -> Iterator[Message]:
-        """The messages of a chunk; of one that was cut off, those before the cut, which no checksum verifies."""
-        try:
-            _, _, size, checksum = _CHUNK_HEAD.unpack_from(data)
-            form, i = _text(data, _CHUNK_HEAD.size)
-            if form not in ("", "zstd", "lz4"):
-                raise RecordingError(f"chunks are compressed as {form!r}; expected lz4 or zstd")
-            inside = inflated(data[i + 8 :], self.scan.room, size)
-            if whole and (len(inside) != size or (checksum and zlib.crc32(inside) != checksum)):
-                raise ValueError("its length or checksum is another")
-            yield from self.records(BytesIO(inside))
-        except InputError:  # a library is missing, or the chunk claims too much
-            raise
-        except Exception:  # whatever damage does to decompressors and parsers
-            self.scan.damaged += whole
+    def index(self, file: BinaryIO) -> int:
+        """Where channels are told once more, at the end of a file that was closed; 0 where they are not."""
+        file.seek(max(self.scan.size - 37, 0))  # a footer, and the letters of the beginning
+        footer = file.read()
+        return int.from_bytes(footer[9:17], "little") if footer[:1] == b"\2" and footer.endswith(self.begin) else 0
 
-    def _record(self, kind: int, data: bytes) -> Message | None:
-        if kind == _MCAP_MESSAGE:
-            number, sequence, log, publish = _MCAP_HEAD.unpack_from(data)
+    def head(self, file: BinaryIO) -> tuple[int, Any, int] | None:
+        """A record's kind, its header, and how many bytes follow; None where there is no further one."""
+        if len(head := file.read(_HEAD.size)) < _HEAD.size:
+            return None
+        kind, length = _HEAD.unpack(head)
+        if kind in (2, 15):  # a footer, or the end of data
+            self.closed = True
+            return None
+        return kind, None, length
+
+    def inside(self, data: bytes, *, whole: bool) -> bytes:
+        """The records in a chunk; of one that was cut off, those before the cut, which no checksum verifies."""
+        _, _, size, checksum = _CHUNK.unpack_from(data)
+        form, i = _text(data, _CHUNK.size)
+        if form not in ("", "zstd", "lz4"):
+            raise RecordingError(f"chunks are compressed as {form!r}; expected lz4 or zstd")
+        found = inflated(data[i + 8 :], self.scan.room, size)
+        if whole and (len(found) != size or (checksum and zlib.crc32(found) != checksum)):
+            raise ValueError("its length or checksum is another")
+        return found
+
+    def record(self, kind: int, _: Any, data: bytes) -> Message | None:
+        """The message in a record, if there is one and it is wanted."""
+        if kind == 5:
+            number, sequence, log, publish = _MESSAGE.unpack_from(data)
             channel = self.channels.get(number)
             self.total += 1
             if channel is not None and self.scan.wanted(channel.topic):
-                seen = self.others[number] = self.others.get(number, 0) + 1
-                return Message(channel, log, publish, sequence, self.total - seen, data[_MCAP_HEAD.size :])
-        elif kind == _SCHEMA:
+                seen = self.seen[number] = self.seen.get(number, 0) + 1
+                return Message(channel, log, publish, sequence, self.total - seen, data[_MESSAGE.size :])
+        elif kind == 3:
             name, i = _text(data, 2)
             form, i = _text(data, i)
             self.schemas[int.from_bytes(data[:2], "little")] = (name, form, _text(data, i)[0])
@@ -285,9 +237,51 @@ class _Mcap:
             name, form, definition = self.schemas.get(schema, ("", "", ""))
             topic, i = _text(data, 4)
             encoding, _ = _text(data, i)
-            name = name if encoding != "ros1" or "/msg/" in name else name.replace("/", "/msg/", 1)
-            self.channels[number] = Channel(topic, name, encoding, definition, form in ("ros2idl", "omgidl"))
+            self.channels[number] = Channel(topic, _ros2(name), encoding, definition, form in ("ros2idl", "omgidl"))
         return None
+
+
+class _Bag(_Mcap):
+    """The same of ROS 1: a record has a header of fields, which rosbags reads."""
+
+    begin, chunk, kinds = b"#ROSBAG V2.0\n", 5, (2, 7)  # messages and connections
+
+    def __init__(self, scan: Scan) -> None:
+        super().__init__(scan)
+        with optional("rosbags", "ros", "a ROS recording"):
+            from rosbags.rosbag1 import reader
+        self.ros: Any = reader
+
+    def index(self, file: BinaryIO) -> int:
+        with suppress(self.ros.ReaderError):
+            found: int = self.ros.Header.read(file).get_uint64("index_pos")
+            self.closed = 0 < found < self.scan.size
+        return found if self.closed else 0
+
+    def head(self, file: BinaryIO) -> tuple[int, Any, int] | None:
+        try:
+            header = self.ros.Header.read(file)
+            return header.get_uint8("op"), header, self.ros.read_uint32(file)
+        except self.ros.ReaderError:  # of the end, and of what is none
+            return None
+
+    def inside(self, data: bytes, *, whole: bool) -> bytes:
+        return inflated(data, self.scan.room)
+
+    def record(self, kind: int, header: Any, data: bytes) -> Message | None:
+        number = header.get_uint32("conn")
+        if kind == 7:
+            about = self.ros.Header.read(BytesIO(struct.pack("<I", len(data)) + data))
+            kinds = _ros2(about.get_string("type")), "ros1", about.get_string("message_definition")
+            self.channels[number] = Channel(header.get_string("topic"), *kinds)
+        elif (channel := self.channels.get(number)) is not None and self.scan.wanted(channel.topic):
+            return Message(channel, header.get_time("time"), None, None, 0, data)
+        return None
+
+
+def _ros2(name: str) -> str:
+    """The name of a type of ROS 1, as ROS 2 has them."""
+    return name.replace("/", "/msg/", 1) if name.count("/") == 1 else name
 
 
 def _text(data: bytes, i: int) -> tuple[str, int]:

@@ -11,20 +11,17 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from scroll_tactile.errors import InputError, RecordingError
 from scroll_tactile.libraries import optional
 from scroll_tactile.recordings import presets
 from scroll_tactile.recordings.bagfiles import Channel
-from scroll_tactile.recordings.paths import fields_of
 
 __all__ = ["MessageTypes", "definitions_of"]
 
 # rclpy's serialize_message reckons with padding behind the count of an empty list, writes none, and leaves as many
 # bytes of whatever was there behind the message: a JointState without velocities and efforts has eight. rosbags
 # takes more than three for damage.
-_END, _WIDEST = 3, 8
+_A_WORD, _MOST_REST = 4, 16
 
 # rosbags writes code for each element of an array of messages, and takes a second for a definition of 100 KB, as
 # MoveIt's are.
@@ -183,21 +180,10 @@ def _read_cdr(store: Any, kind: str, data: bytes) -> object:
     try:
         return store.deserialize_cdr(data, kind)
     except Exception:
-        about = store.get_msgdef(kind)
-        with suppress(Exception):  # whatever damage does; the first error says it
-            read = {b"\0\0": about.deserialize_cdr_be, b"\0\1": about.deserialize_cdr_le}[data[:2]]
-            message, end = read(data[4:], 0, about.cls, store)
-            if len(data) - 4 - end <= _END + _WIDEST * _empty_lists(message):
-                return message
+        for rest in range(_A_WORD, _MOST_REST + 1, _A_WORD):
+            with suppress(Exception):  # whatever damage does; the first error says it
+                return store.deserialize_cdr(data[:-rest], kind)
         raise
-
-
-def _empty_lists(message: Any) -> int:
-    """How many lists of 8-byte numbers in a message are empty."""
-    if isinstance(message, np.ndarray):
-        return int(message.size == 0 and message.itemsize == _WIDEST)
-    inside = message if isinstance(message, list) else [getattr(message, name) for name in fields_of(message)]
-    return sum(map(_empty_lists, inside))
 
 
 # What rosbags' parser of IDL takes long for: it tries what stands in parentheses eighty times, a sequence in sequences

@@ -69,31 +69,46 @@ class RosBag(Source):
 
     def contents(self) -> Contents:
         """The numbers in the first messages of each topic, those of known sensors first."""
-        seen: dict[Channel, list[int]] = {}
-        entries: dict[Channel, dict[str, Entry]] = {}
+        entries, count = self._entries(None)
+        looked = f"in its first {count} messages, among others perhaps" if count == _LOOKED else ""
+        return Contents(self.address, tuple(entries), looked, tuple(dict.fromkeys(self.notes)))
+
+    def _entries(self, path: FieldPath | None) -> tuple[list[Entry], int]:
+        """Where numbers are in the first messages, or where a path leads to some; and how many messages were seen.
+
+        Where it leads to none, further messages are looked at: a topic may begin late.
+        """
+        logs: dict[Channel, list[int]] = {}
+        found: dict[Channel, dict[str, tuple[int, ...]]] = {}
         failed: set[Channel] = set()
-        for message in itertools.islice(self._messages(lambda topic: True), _LOOKED):
-            channel = message.channel
-            seen.setdefault(channel, []).append(message.log)
-            found = entries.setdefault(channel, {})
-            if channel not in failed and (not found or len(seen[channel]) <= _TRIED):
-                try:
-                    decoded = self.types.decode(channel, message.data)
-                except RecordingError as error:
-                    self.notes.append(str(error))
-                    failed.add(channel)
-                    continue
-                for text, shape in [*presets.fields_for(channel.type, decoded), *_numbers(decoded)]:
-                    found.setdefault(text, Entry(channel.topic, text, shape, kind=channel.type))
-        total = sum(map(len, seen.values()))
-        listed = [
-            Entry(entry.topic, entry.field, entry.shape, len(logs), _rate(logs), entry.kind)
-            for channel, logs in seen.items()
-            for entry in entries[channel].values()
+        count = 0
+        for message in self._messages(lambda topic: True):
+            if count >= _LOOKED and (path is None or any(found.values())):
+                break
+            count, channel = count + 1, message.channel
+            logs.setdefault(channel, []).append(message.log)
+            fields = found.setdefault(channel, {})
+            if channel in failed or (fields and (path is not None or len(logs[channel]) > _TRIED)):
+                continue
+            try:
+                decoded = self.types.decode(channel, message.data)
+                if path is not None:
+                    shapes = [(path.text, path.reading(decoded).shape)]
+                else:
+                    shapes = [*presets.fields_for(channel.type, decoded), *_numbers(decoded)]
+                for text, shape in shapes:
+                    fields |= {text: shape} if text not in fields and shape != (0,) else {}
+            except FieldError:
+                failed.add(channel)
+            except RecordingError as error:
+                self.notes.append(str(error))
+                failed.add(channel)
+        entries = [
+            Entry(channel.topic, text, shape, len(logs[channel]), _rate(logs[channel]), channel.type)
+            for channel, fields in found.items()
+            for text, shape in fields.items()
         ]
-        listed.sort(key=lambda entry: not presets.is_known(entry.kind))
-        looked = f"in its first {total} messages, among others perhaps" if total == _LOOKED else ""
-        return Contents(self.address, tuple(listed), looked, tuple(dict.fromkeys(self.notes)))
+        return sorted(entries, key=lambda entry: not presets.is_known(entry.kind)), count
 
     def blocks(self) -> Iterator[Block]:
         """The readings of the requested topic; raises FieldError, with what there is, for one that is not there."""
@@ -171,41 +186,18 @@ class RosBag(Source):
         topic, text = self.request.topic, self.request.field
         if topic is not None and text is not None:
             return topic, text
-        topics = self._having(FieldPath(text)) if text is not None else []
-        if len(topics) == 1 and text is not None:
-            return topics[0], text
+        what, entries = "expected a topic and a field to read", []
+        if text is not None:
+            entries, _ = self._entries(FieldPath(text))
+            topics = {entry.topic for entry in entries}
+            if len(topics) == 1 or self.request.likely in topics:
+                return str(self.request.likely if len(topics) > 1 else entries[0].topic), text
+            what = f"{'several topics have' if topics else 'no topic has'} a field {text!r}"
         contents = self.contents()
-        if text is None:
-            entries = tuple(entry for entry in contents.entries if topic in (None, entry.topic))
-            what = "expected a topic and a field to read"
-        else:
-            entries = tuple(entry for entry in contents.entries if entry.topic in topics and entry.field == text)
-            entries, what = (
-                entries or contents.entries,
-                f"{'several topics have' if topics else 'no topic has'} a field {text!r}",
-            )
+        entries = entries or [entry for entry in contents.entries if topic in (None, entry.topic)]
         if not entries:
             self._absent(topic)
-        raise replace(contents, entries=entries).refused(what)
-
-    def _having(self, path: FieldPath) -> list[str]:
-        """The topics in whose messages a path leads to numbers; the likely one alone where it is among them."""
-        topics: dict[str, bool] = {}
-        tries: dict[str, int] = {}
-        for i, message in enumerate(self._messages(lambda name: tries.get(name, 0) < _LOOKED)):
-            topic = message.channel.topic
-            if i >= _LOOKED and any(topics.values()):
-                break
-            tries[topic] = tries.get(topic, 0) + 1
-            try:
-                topics[topic] = path.reading(self.types.decode(message.channel, message.data)).size > 0
-            except RecordingError as error:  # of a field that it has not, or of its type
-                tries[topic] += _LOOKED * (not isinstance(error, FieldError))
-            if topics.get(topic):
-                tries[topic] = _LOOKED
-                if topic == self.request.likely:
-                    return [topic]
-        return [topic for topic, has in topics.items() if has]
+        raise replace(contents, entries=tuple(entries)).refused(what)
 
     def _absent(self, topic: str | None) -> NoReturn:
         problems = "; ".join(self.notes)
@@ -356,55 +348,67 @@ class Stamps:
 
     def __init__(self, clock: str | None, field: str, notes: list[str]) -> None:
         self.clock, self.field, self.notes = clock, field, notes
-        self.device: tuple[str, FieldPath] | None = None
-        self.counter: FieldPath | None = None
-        self.header: Callable[[Any], Any] | None = None
+        self.device = ""  # the path to its clock
+        self.clocks: dict[str, Callable[[Message, Any], Any]] = {}
+        self.counters: dict[str, Callable[[Message, Any], int]] = {}
+        self.values: dict[str, list[Any]] = {}
         self.unit: float | None = None
-        self.coarse: set[str] | None = None
-        self.last, self.turns = 0, 0  # of the device's clock, and how far it has come by turning over
-        self._empty()
-
-    def _empty(self) -> None:
-        self.times: dict[str, list[int]] = {name: [] for name in ("header", "publish", "log")}
-        self.values: list[Any] = []
-        self.counts: dict[str, list[int]] = {"message": [], "sequence": [], "all": []}
+        self.coarse: list[str] | None = None
+        self.last, self.turns = 0.0, 0  # of the device's clock, and how often it has turned over
 
     def add(self, message: Message, decoded: Any) -> None:
         """Take the stamps of one message."""
-        if self.coarse is None and not self.times["log"]:
-            self._begin(decoded)
-        self.times["log"].append(message.log)
-        if message.publish is not None:
-            self.times["publish"].append(message.publish)
-        if self.header is not None:
-            self.times["header"].append(_nanoseconds(self.header(decoded)) or 0)
-        if self.device is not None:
-            self.values.append(_stamp(self.device[1], decoded))
-        if self.counter is not None:
-            self.counts["message"].append(int(self.counter.values(decoded)[0]))
-        if message.sequence is not None:  # of the topic, or of all of them: then less the others it goes on by one
-            self.counts["sequence"].append(message.sequence)
-            self.counts["all"].append(message.sequence - message.others)
+        if not self.clocks:
+            self._begin(message, decoded)
+        for name, stamp in self.clocks.items():
+            self.values[name].append(stamp(message, decoded))
+        for name, count in self.counters.items():
+            self.values[name].append(count(message, decoded))
 
     def take(self) -> tuple[dict[str, _Times], dict[str, npt.NDArray[np.int64]]]:
         """The clocks in seconds and the counters since the last time, in the order of preference."""
         clocks = {}
-        log = _seconds(self.times["log"])
-        if self.device is not None:
-            values = self._turned(self.values)
+        for name in self.clocks:
+            if name in CLOCKS[1:]:
+                clocks[name] = _seconds(self.values[name])
+                continue
+            values = self._turned(self.values[name])
             if self.unit is None:
-                self.unit = _unit(self.device[0], self.values, values, log)
-            name = "device" if self.clock is None or self.clock in CLOCKS else self.clock
+                self.unit = _unit(self.device, self.values[name], values, _seconds(self.values["log"]))
             clocks[name] = values * self.unit if self.unit >= 1 else values / round(1 / self.unit)
-        clocks |= {name: _seconds(stamps) for name, stamps in self.times.items() if stamps}
         if self.coarse is None:
-            self.coarse = {name for name in ("device", "header") if name != self.clock and _is_coarse(clocks.get(name))}
+            self.coarse = [name for name in ("device", "header") if name != self.clock and _is_coarse(clocks.get(name))]
             self.notes += [f"the {name}'s stamps are whole seconds: times are another clock's" for name in self.coarse]
         for name in self.coarse:
             del clocks[name]
-        counts = {name: np.array(values, np.int64) for name, values in self.counts.items() if values}
-        self._empty()
+        counts = {name: np.array(self.values[name], np.int64) for name in self.counters}
+        self.values = {name: [] for name in self.values}
         return clocks, counts
+
+    def _begin(self, message: Message, decoded: Any) -> None:
+        root = re.match(r"\s*\w+\[-?\d+\]\.", self.field)
+        before = ["", *([root.group().strip()] if root else [])]
+        if self.clock is not None and self.clock not in CLOCKS:
+            name, device = self.clock, FieldPath(self.clock)
+            _stamp(device, decoded)
+        else:
+            name, device = "device", _first_of(decoded, [f"{b}{name}" for b in before for name in _DEVICE])
+        if device is not None:
+            self.device, self.clocks[name] = device.text, lambda _, decoded: _stamp(device, decoded)
+        header = _json_header if isinstance(decoded, Mapping) else attrgetter("header.stamp")
+        with suppress(AttributeError, KeyError, TypeError):
+            if _nanoseconds(header(decoded)) is not None:
+                self.clocks["header"] = lambda _, decoded: _nanoseconds(header(decoded))
+        if message.publish is not None:
+            self.clocks["publish"] = lambda message, _: message.publish
+        self.clocks["log"] = lambda message, _: message.log
+        paths = ["header.seq", *(f"{b}{name}" for b in before for name in _COUNTER)]
+        if (counter := _first_of(decoded, paths, counts=True)) is not None:
+            self.counters["message"] = lambda _, decoded: int(counter.values(decoded)[0])
+        if message.sequence is not None:  # of the topic, or of all of them: then less the others it goes on by one
+            self.counters["sequence"] = lambda message, _: message.sequence or 0
+            self.counters["all"] = lambda message, _: (message.sequence or 0) - message.others
+        self.values = {name: [] for name in (*self.clocks, *self.counters)}
 
     def _turned(self, values: list[Any]) -> _Times:
         """A device's clock that goes on where it turns over, as one of 16 bits does after a minute of milliseconds."""
@@ -418,34 +422,19 @@ class Stamps:
             times = times + turns * 2.0**bits
         return times
 
-    def _begin(self, decoded: Any) -> None:
-        header = _json_header if isinstance(decoded, Mapping) else attrgetter("header.stamp")
-        with suppress(AttributeError, KeyError, TypeError):
-            self.header = None if _nanoseconds(header(decoded)) is None else header
-        root = re.match(r"\s*\w+\[-?\d+\]\.", self.field)
-        before = ["", *([root.group().strip()] if root else [])]
-        if self.clock is not None and self.clock not in CLOCKS:
-            path = FieldPath(self.clock)
-            _stamp(path, decoded)
-            self.device = (self.clock, path)
-        else:
-            self.device = _first_of(decoded, [f"{b}{name}" for b in before for name in _DEVICE])
-        counter = _first_of(decoded, ["header.seq", *(f"{b}{name}" for b in before for name in _COUNTER)], counts=True)
-        self.counter = None if counter is None else counter[1]
-
 
 def _json_header(decoded: Any) -> Any:
     return decoded["header"]["stamp"]
 
 
-def _first_of(decoded: Any, texts: list[str], counts: bool = False) -> tuple[str, FieldPath] | None:
+def _first_of(decoded: Any, texts: list[str], counts: bool = False) -> FieldPath | None:
     """The first of some paths that leads to a stamp, or to a whole number where it `counts`."""
     for text in texts:
         path = FieldPath(text)
         with suppress(FieldError):
             value = _stamp(path, decoded)
             if not counts or isinstance(value, int):
-                return text, path
+                return path
     return None
 
 

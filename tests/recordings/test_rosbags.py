@@ -272,6 +272,34 @@ def test_a_bag_that_was_cut_anywhere_gives_its_whole_messages(tmp_path, store1, 
         assert most == 300
 
 
+def test_a_part_of_a_compressed_bag_is_read_alone(tmp_path, store2):
+    values, messages = floats(store2, 30)
+    for compress in ("MESSAGE ZSTD", "FILE ZSTD"):
+        folder = bags.write(tmp_path / compress, store2, {"/skin": messages}, form="db3", compress=compress)
+        (part,) = (file for file in folder.iterdir() if file.suffix != ".yaml")
+        np.testing.assert_array_equal(read(part, topic="/skin", field="data").readings, values)
+    whole = part.read_bytes()
+    part.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(RecordingError):
+        read(part, topic="/skin", field="data")
+
+
+def test_messages_that_wait_in_a_write_ahead_log_are_read(tmp_path, store2):
+    values, messages = floats(store2, 30)
+    path = next(bags.write(tmp_path / "b", store2, {"/skin": messages}, form="db3").glob("*.db3"))
+    base = sqlite3.connect(path)
+    base.execute("PRAGMA journal_mode=WAL")
+    base.execute("PRAGMA wal_autocheckpoint=0")
+    base.execute("INSERT INTO messages (topic_id, timestamp, data) SELECT topic_id, timestamp + 10, data FROM messages")
+    base.commit()
+    (tmp_path / "copy").mkdir()
+    for file in path.parent.glob("*.db3*"):  # as a recorder left them that was stopped by force
+        shutil.copy(file, tmp_path / "copy")
+    base.close()
+    readings = read(tmp_path / "copy" / path.name, topic="/skin", field="data").readings
+    np.testing.assert_array_equal(np.sort(readings, 0), np.sort(np.repeat(values, 2, 0), 0))
+
+
 def test_a_bag_that_its_recorder_never_closed_is_read(tmp_path, store1):
     values, messages = floats(store1, 300)
     path = bags.write(tmp_path / "b.bag", store1, {"/skin": messages}, form="bag")

@@ -150,7 +150,8 @@ class _Mcap:
     closed: whether the file was closed by its recorder.
     """
 
-    begin, chunk, kinds = b"\x89MCAP0\r\n", 6, (3, 4, 5)  # schemas, channels and messages
+    begin, chunk = b"\x89MCAP0\r\n", 6
+    kinds: tuple[int, ...] = (3, 4, 5)  # schemas, channels and messages
 
     def __init__(self, scan: Scan) -> None:
         self.scan, self.closed, self.total = scan, False, 0
@@ -244,7 +245,8 @@ class _Mcap:
 class _Bag(_Mcap):
     """The same of ROS 1: a record has a header of fields, which rosbags reads."""
 
-    begin, chunk, kinds = b"#ROSBAG V2.0\n", 5, (2, 7)  # messages and connections
+    begin, chunk = b"#ROSBAG V2.0\n", 5
+    kinds = (2, 7)  # messages and connections
 
     def __init__(self, scan: Scan) -> None:
         super().__init__(scan)

@@ -30,7 +30,7 @@ SUFFIXES = (".bag", ".mcap", ".db3")
 """What ROS's recordings end in."""
 
 _LOOKED = 2000  # messages are looked at to say what a bag holds
-_TRIED = 10  # messages of a topic are decoded for it: the first may have empty arrays
+_TRIED = 10  # messages of a topic are decoded for it: the first may have empty arrays, or be damaged
 _LONGEST = 1 << 20  # bytes of metadata.yaml
 
 _PIXELS = 1 << 24  # of a compressed picture: 4096 × 4096, where the largest camera of a gel has 1600 × 1200
@@ -71,7 +71,7 @@ class RosBag(Source):
         """The numbers in the first messages of each topic, those of known sensors first."""
         entries, count = self._entries(None)
         looked = f"in its first {count} messages, among others perhaps" if count == _LOOKED else ""
-        return Contents(self.address, tuple(entries), looked, tuple(dict.fromkeys(self.notes)))
+        return Contents(self.address, tuple(entries), looked, tuple(self.notes))
 
     def _entries(self, path: FieldPath | None) -> tuple[list[Entry], int]:
         """Where numbers are in the first messages, or where a path leads to some; and how many messages were seen.
@@ -80,7 +80,7 @@ class RosBag(Source):
         """
         logs: dict[Channel, list[int]] = {}
         found: dict[Channel, dict[str, tuple[int, ...]]] = {}
-        failed: set[Channel] = set()
+        failed: dict[Channel, int] = {}
         count = 0
         for message in self._messages(lambda topic: True):
             if count >= _LOOKED and (path is None or any(found.values())):
@@ -88,7 +88,7 @@ class RosBag(Source):
             count, channel = count + 1, message.channel
             logs.setdefault(channel, []).append(message.log)
             fields = found.setdefault(channel, {})
-            if channel in failed or (fields and (path is not None or len(logs[channel]) > _TRIED)):
+            if failed.get(channel, 0) >= _TRIED or (fields and (path is not None or len(logs[channel]) > _TRIED)):
                 continue
             try:
                 decoded = self.types.decode(channel, message.data)
@@ -98,11 +98,10 @@ class RosBag(Source):
                     shapes = [*presets.fields_for(channel.type, decoded), *_numbers(decoded)]
                 for text, shape in shapes:
                     fields |= {text: shape} if text not in fields and shape != (0,) else {}
-            except FieldError:
-                failed.add(channel)
             except RecordingError as error:
-                self.notes.append(str(error))
-                failed.add(channel)
+                failed[channel] = failed.get(channel, 0) + 1
+                if not isinstance(error, FieldError) and str(error) not in self.notes:
+                    self.notes.append(str(error))
         entries = [
             Entry(channel.topic, text, shape, len(logs[channel]), _rate(logs[channel]), channel.type)
             for channel, fields in found.items()
@@ -165,19 +164,23 @@ class RosBag(Source):
     def _decoded(self, topic: str) -> Iterator[tuple[Message, Any]]:
         """The messages of a topic as objects; those of the topic that labels go to `marks`."""
         labels = self.request.labels
-        decoded, unfit = None, 0
+        unfit, fit = 0, 0
+        why: RecordingError | None = None
         for message in self._messages(lambda name: name in (topic, labels)):
             try:
                 decoded = self.types.decode(message.channel, message.data)
-            except RecordingError:
-                if decoded is None:
-                    raise
-                unfit += 1
+            except RecordingError as error:
+                unfit, why = unfit + 1, error
+                if not fit and unfit >= _TRIED:  # of another type, and not damaged
+                    break
                 continue
+            fit += 1
             if message.channel.topic == labels:
                 self.marks.append((message.log / 1e9, _text_in(decoded, message.channel)))
             if message.channel.topic == topic:
                 yield message, decoded
+        if why is not None and not fit:
+            raise why
         if unfit:
             self.notes.append(f"{unfit} messages do not fit their type, and were left out")
 
@@ -186,7 +189,8 @@ class RosBag(Source):
         topic, text = self.request.topic, self.request.field
         if topic is not None and text is not None:
             return topic, text
-        what, entries = "expected a topic and a field to read", []
+        what = "expected a topic and a field to read"
+        entries: list[Entry] = []
         if text is not None:
             entries, _ = self._entries(FieldPath(text))
             topics = {entry.topic for entry in entries}
@@ -236,6 +240,8 @@ def _files(folder: Path) -> list[Path]:
         with optional("rosbags", "ros", "a ROS recording"):
             from ruamel.yaml import YAML  # comes with rosbags
         about = YAML(typ="safe").load(read_text(folder, listed, _LONGEST))
+        if about is None:
+            raise RecordingError(f"{listed} is empty, as after a power cut: remove it, and the parts there are read")
         names = about["rosbag2_bagfile_information"]["relative_file_paths"]
         files = [folder / Path(name).name for name in names if isinstance(name, str)]
     if absent := [file.name for file in files if not file.exists()]:
@@ -389,11 +395,11 @@ class Stamps:
         root = re.match(r"\s*\w+\[-?\d+\]\.", self.field)
         before = ["", *([root.group().strip()] if root else [])]
         if self.clock is not None and self.clock not in CLOCKS:
-            name, device = self.clock, FieldPath(self.clock)
-            _stamp(device, decoded)
+            path: FieldPath | None = FieldPath(self.clock)
         else:
-            name, device = "device", _first_of(decoded, [f"{b}{name}" for b in before for name in _DEVICE])
-        if device is not None:
+            path = _first_of(decoded, [f"{b}{name}" for b in before for name in _DEVICE])
+        if (device := path) is not None:
+            name = "device" if self.clock in (None, *CLOCKS) else str(self.clock)
             self.device, self.clocks[name] = device.text, lambda _, decoded: _stamp(device, decoded)
         header = _json_header if isinstance(decoded, Mapping) else attrgetter("header.stamp")
         with suppress(AttributeError, KeyError, TypeError):

@@ -335,7 +335,7 @@ def _database(path: Path) -> Any:
 
     why: Exception | None = None
     for mode in ("mode=ro", "mode=ro&immutable=1"):  # a write-ahead log cannot be read where nothing may be written
-        base = sqlite3.connect(f"{path.resolve().as_uri()}?{mode}", uri=True)
+        base = sqlite3.connect(f"{path.resolve().as_uri()}?{mode}", uri=True, timeout=1)
         base.text_factory = lambda data: data.decode(errors="replace")
         try:
             base.execute("PRAGMA trusted_schema=OFF")

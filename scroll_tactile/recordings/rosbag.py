@@ -152,7 +152,8 @@ class RosBag(Source):
         samples.pop(0, None)
         least, cure = min(samples), ""
         shorter = re.sub(r"\[(\d*):\d*\]$", lambda m: f"[{m[1] or 0}:{int(m[1] or 0) + least}]", path.text)
-        for text in (shorter, f"{path.text}[0:{least}]", path.text.replace("[*]", "[0]", 1)):
+        some = (path.text.replace("[*]", f"[0:{least // of}]", 1) for of in range(1, least + 1))
+        for text in (shorter, f"{path.text}[0:{least}]", *some):
             with suppress(FieldError):
                 if not cure and len({FieldPath(text).reading(sample).size for sample in samples.values()}) == 1:
                     cure = f". Name elements that each of them has, as in field={text!r}"

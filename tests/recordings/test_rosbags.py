@@ -532,6 +532,17 @@ def test_readings_of_several_sizes_are_refused_with_a_field_that_all_have(tmp_pa
     assert len(read(path, field=cure)) == len(sizes)
 
 
+def test_a_message_with_fewer_taxels_leaves_those_that_all_have(tmp_path, store2):
+    messages = [(bags.START + i / 100, bags.uskin(store2, np.ones((4 if i == 2 else 16, 3)), i, 1.0)) for i in range(5)]
+    path = bags.write(tmp_path / "b", store2, {"/xServTopic": messages}, form="mcap")
+    cure = "sensors[0].taxels[0:4].{x,y,z}"
+    with pytest.raises(RecordingError, match=re.escape("1 have 12 values, 4 have 48 values. Name elements that each")):
+        read(path, preset="xela-uskin")
+    with pytest.raises(RecordingError, match=re.escape(f"as in field={cure!r}")):
+        read(path, preset="xela-uskin")
+    assert read(path, field=cure).readings.shape == (5, 12)
+
+
 def test_a_topic_that_begins_late_is_found(tmp_path, store2):
     _, early = floats(store2, 2500)
     late = [(bags.START + 30 + i, bags.biotac(store2, np.arange(19, dtype=np.int16), 1.0 + i)) for i in range(3)]

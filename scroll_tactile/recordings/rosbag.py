@@ -64,6 +64,7 @@ class RosBag(Source):
         super().__init__(path, address, request)
         self.files = _files(path) if path.is_dir() else [path]
         self.types = MessageTypes(request.definitions)
+        self.odd: list[str] = []  # what was found before reading
         for file in self.files:
             self.budget.add(stored_bytes(file))
 
@@ -196,7 +197,9 @@ class RosBag(Source):
             entries, _ = self._entries(FieldPath(text))
             topics = {entry.topic for entry in entries}
             if len(topics) == 1 or self.request.likely in topics:
-                return str(self.request.likely if len(topics) > 1 else entries[0].topic), text
+                topic = self.request.likely if len(topics) > 1 else entries[0].topic
+                self.odd = [f"{other} has such readings, too" for other in sorted(map(str, topics - {topic}))]
+                return str(topic), text
             what = f"{'several topics have' if topics else 'no topic has'} a field {text!r}"
         contents = self.contents()
         entries = entries or [entry for entry in contents.entries if topic in (None, entry.topic)]
@@ -218,7 +221,7 @@ class RosBag(Source):
         raise FieldError(f"{self.address} holds no message of topic {topic!r}{nearest(str(topic), list(topics))}")
 
     def _messages(self, wanted: Callable[[str], bool]) -> Iterator[Message]:
-        self.notes.clear()
+        self.notes[:] = self.odd
         self.marks.clear()
         self.cut_off = False
         for file in self.files:

@@ -563,7 +563,9 @@ def test_two_hands_at_two_rates_are_asked_for(tmp_path, store2):
     for name, rate in (("/left/tactile", 100), ("/right/tactile", 50)):
         assert read(path, preset="biotac", topic=name).report.rate == pytest.approx(rate, rel=1e-3)
     path = bags.write(tmp_path / "rh", store2, {**hands, "/rh/tactile": hands["/left/tactile"]}, form="db3")
-    assert read(path, preset="biotac").topic == "/rh/tactile"
+    recording = read(path, preset="biotac")
+    assert recording.topic == "/rh/tactile"
+    assert recording.report.notes == ("/left/tactile has such readings, too", "/right/tactile has such readings, too")
 
 
 @pytest.mark.parametrize(("bits", "step", "unit"), [(16, 10, "ms"), (16, 10_000, "us"), (32, 10_000_000, "ns")])

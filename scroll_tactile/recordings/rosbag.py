@@ -451,7 +451,7 @@ def _first_of(decoded: Any, texts: list[str], counts: bool = False) -> FieldPath
 def _stamp(path: FieldPath, decoded: Any) -> float:
     found = path.values(decoded)
     value = found[0] if len(found) == 1 else None
-    if (stamp := _nanoseconds(value)) is not None:
+    if not isinstance(value, int | float) and (stamp := _nanoseconds(value)) is not None:
         return stamp / 1e9
     if isinstance(value, np.integer | np.floating):
         value = value.item()

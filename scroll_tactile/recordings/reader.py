@@ -16,6 +16,7 @@ from scroll_tactile.errors import ChannelCountError, InputError, RecordingError
 from scroll_tactile.recordings import presets
 from scroll_tactile.recordings.blocks import Block, Contents, Request, Source, guarded
 from scroll_tactile.recordings.bounds import require_file
+from scroll_tactile.recordings.decoding import definitions_of
 from scroll_tactile.recordings.locations import local
 from scroll_tactile.recordings.recording import Episode, Gap, Recording, Report, longest_step, only_columns, resampled
 
@@ -30,6 +31,7 @@ _FAST, _BATCH, _LATE = (
 # latest twentieth of all steps are so many times as long: the pauses between batches are no gaps
 
 _Address = str | PathLike[str]
+_Definitions = Mapping[str, str] | str | PathLike[str] | None
 _Times = npt.NDArray[np.float64]
 
 
@@ -48,7 +50,7 @@ def read(
     header: bool | None = None,
     delimiter: str | None = None,
     decimal: str = ".",
-    definitions: Mapping[str, str] | None = None,
+    definitions: _Definitions = None,
 ) -> Recording:
     """All readings of a file, or of a folder that is one recording.
 
@@ -68,7 +70,8 @@ def read(
         `annotations`.
     resample: a rate in Hz; see `resampled` for the rule. Readings are left as they are without it.
     header, delimiter, decimal: how a table is written, where it does not show.
-    definitions: of messages that a bag does not define, the text of the .msg by the type's name.
+    definitions: of messages that a bag does not define, a folder of .msg files (`package/msg/Name.msg`, or flat), or
+        their texts by the types' names. Presets bring those of their drivers.
 
     Raises FieldError where topic or field are not there or not given, listing what there is; RecordingError where the
     file is not there, damaged, ragged, empty, of no known format, or claims to hold more than one of its size can (see
@@ -76,7 +79,17 @@ def read(
     of another sensor; InputError for a clock that is not there.
     """
     request = Request(
-        topic, field, clock, rate, labels, header, delimiter, decimal, None, definitions or {}, tuple(annotate)
+        topic,
+        field,
+        clock,
+        rate,
+        labels,
+        header,
+        delimiter,
+        decimal,
+        None,
+        definitions_of(definitions),
+        tuple(annotate),
     )
     address = fspath(path)
     with local(address) as place, guarded(address):
@@ -100,14 +113,16 @@ def iterate(
     header: bool | None = None,
     delimiter: str | None = None,
     decimal: str = ".",
-    definitions: Mapping[str, str] | None = None,
+    definitions: _Definitions = None,
 ) -> Iterator[Recording]:
     """The readings of a file block by block, as recordings of at most 4096 readings: for files beyond memory.
 
     Arguments and errors are those of `read`. Blocks come in the order of the file, and each has the report of its own
     readings; the clock is chosen from the first.
     """
-    request = Request(topic, field, clock, rate, labels, header, delimiter, decimal, definitions=definitions or {})
+    request = Request(
+        topic, field, clock, rate, labels, header, delimiter, decimal, definitions=definitions_of(definitions)
+    )
     address = fspath(path)
     with local(address) as place:
         with guarded(address):
@@ -124,14 +139,14 @@ def iterate(
             yield recording
 
 
-def describe(path: _Address, *, definitions: Mapping[str, str] | None = None) -> Contents:
+def describe(path: _Address, *, definitions: _Definitions = None) -> Contents:
     """What a file has: its topics and fields with their shapes and rates, and a line to copy.
 
     Of a bag the first 2000 messages are looked at. Raises RecordingError as `read` does.
     """
     address = fspath(path)
     with local(address) as place, guarded(address):
-        return _open(place, address, Request(definitions=definitions or {})).contents()
+        return _open(place, address, Request(definitions=definitions_of(definitions))).contents()
 
 
 def find(path: _Address) -> list[Path]:

@@ -57,8 +57,8 @@ _BY = ("topic", "file", "folder", "task")
 class SourceOptions:
     """How sources are read, cut into touches, and named.
 
-    topic, field, clock, columns, preset, labels, annotate: as of `recordings.read`. cut: None cuts by the intervals
-    where there are some, by episodes where a recording has some, and not otherwise.
+    topic, field, clock, columns, definitions, preset, labels, annotate: as of `recordings.read`. cut: None cuts by the
+    intervals where there are some, by episodes where a recording has some, and not otherwise.
     material: the name of all touches. by: what names each touch, as of `recordings.touches`, or "folder:2", the second
     folder below one of `tops`, see `among`. intervals: the table's. At most one of the three names them; without any,
     episodes name themselves. quantities: that are declared before anything is learned, as the table's headings do
@@ -78,6 +78,7 @@ class SourceOptions:
     field: str | None = None
     clock: str | None = None
     columns: str | None = None
+    definitions: Mapping[str, str] | Path | None = None
     preset: str | None = None
     labels: str | None = None
     annotate: Sequence[str] = ()
@@ -192,6 +193,7 @@ class SourceOptions:
             field=self.field,
             clock=self.clock,
             columns=self.columns,
+            definitions=self.definitions,
             preset=self.preset,
             rate=sensor.rate,  # where it has no clock
             labels=self.labels,

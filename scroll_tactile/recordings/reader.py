@@ -169,8 +169,8 @@ def _open(path: Path, address: str, request: Request, preset: str | None = None)
     if kind is None:
         what = "a folder that is none of these" if path.is_dir() else repr(path.name)
         raise RecordingError(
-            "expected a recording: .bag, .db3, .mcap, .npy, .csv, .h5, .zarr, the folder of a ROS 2 bag with its "
-            f"metadata.yaml, or of a LeRobot data set; came {what} at {address}"
+            "expected a recording: .bag, .db3, .mcap, .npy, .npz, .mat, .csv, .parquet, .feather, .h5, .zarr, the "
+            f"folder of a ROS 2 bag with its metadata.yaml, or of a LeRobot data set; came {what} at {address}"
         )
     if not path.is_dir():
         require_file(path)
@@ -184,7 +184,7 @@ def _open(path: Path, address: str, request: Request, preset: str | None = None)
             )
     if request.annotate and not source.annotate:
         raise InputError(
-            f"{address} has no columns to annotate touches by; expected a LeRobot data set; came "
+            f"{address} has no columns to annotate touches by; expected arrays; came "
             f"annotate={request.annotate[0]!r}: give values and labels in a table of intervals=",
             argument="annotate intervals",
         )
@@ -192,20 +192,20 @@ def _open(path: Path, address: str, request: Request, preset: str | None = None)
 
 
 def _kind(path: Path) -> type[Source] | None:
-    from scroll_tactile.recordings import arraystores, delimited, lerobot, rosbag, zarrfile
+    from scroll_tactile.recordings import arraystores, columnar, delimited, rosbag, zarrfile
 
     if rosbag.is_rosbag(path):
         return rosbag.RosBag
-    if path.is_dir() and lerobot.is_lerobot(path):
-        return lerobot.LeRobot
+    if path.is_dir() and columnar.is_lerobot(path):
+        return columnar.LeRobot
     if zarrfile.is_zarr(path):
-        return arraystores.ZarrBuffer
+        return zarrfile.ZarrBuffer
     suffix = "" if path.is_dir() else path.suffix.lower()
-    if suffix in (".h5", ".hdf5", ".hdf"):
-        return arraystores.Hdf5
     if suffix and delimited.is_table(path):
         return delimited.Delimited
-    return arraystores.Npy if suffix == ".npy" else None
+    kinds: dict[str, type[Source]] = {".npy": arraystores.Npy, ".npz": arraystores.Npz, ".mat": arraystores.Mat}
+    kinds |= dict.fromkeys((".h5", ".hdf5", ".hdf"), arraystores.Hdf5)
+    return (kinds | dict.fromkeys((".parquet", ".feather"), columnar.Columnar)).get(suffix)
 
 
 def _timed(source: Source, request: Request) -> Iterator[Block]:
@@ -320,18 +320,19 @@ def assemble(
         readings = readings[order]
         clocks = {name: times[order] for name, times in clocks.items()}
         counters = {name: counts[order] for name, counts in counters.items()}
-    episodes = _spans(clocks["log"], source.marks) if source.marks else _numbered(block.episodes, source.names)
+    episodes = _spans(clocks["log"], source.marks) if source.marks else _numbered(block.episodes, source)
     begins = [] if source.marks or source.continuous else [episode.begin for episode in episodes if episode.begin]
     times = np.full(len(readings), np.nan) if clock is None else clocks[clock]
     unset = int(np.count_nonzero(clocks["header"] == 0)) if "header" in clocks else 0
     return readings, times, episodes, _report(times, clock, counters, np.array(begins, np.int64), unset)
 
 
-def _numbered(numbers: npt.NDArray[np.int64] | None, names: dict[int, str]) -> tuple[Episode, ...]:
+def _numbered(numbers: npt.NDArray[np.int64] | None, source: Source) -> tuple[Episode, ...]:
     if numbers is None:
         return ()
     borders = [0, *(np.flatnonzero(np.diff(numbers)) + 1).tolist(), len(numbers)]
-    return tuple(Episode(begin, end, names.get(int(numbers[begin]))) for begin, end in itertools.pairwise(borders))
+    spans = [(begin, end, int(numbers[begin])) for begin, end in itertools.pairwise(borders)]
+    return tuple(Episode(begin, end, source.names.get(n), source.paths.get(n, "")) for begin, end, n in spans)
 
 
 def _spans(logged: npt.NDArray[np.float64], marks: list[tuple[float, str]]) -> tuple[Episode, ...]:

@@ -43,7 +43,6 @@ Mode = Literal["write", "read"]
 _options: ContextVar[dict[str, str]] = ContextVar("_options")  # of the command that was typed, by their names in Python
 
 
-LabelSource = StrEnum("LabelSource", ["file", "folder", "topic", "task"])
 Cut = StrEnum("Cut", ["episodes", "intervals", "none", "contact"])
 
 MemoryFolder = Annotated[Path, Argument(help="The folder of the memory.", show_default=False)]
@@ -93,7 +92,14 @@ class Named(Reading):
     """How recordings are read, cut into touches and named: the fields of `SourceOptions`, as they are typed."""
 
     material: Annotated[str | None, Option("--label", help="What all of them are touches of.")] = None
-    by: Annotated[LabelSource | None, Option("--label-by", help="What names each touch.")] = None
+    by: Annotated[
+        str | None,
+        Option(
+            "--label-by",
+            help="What names each touch: file, folder, topic or task; or group:2, the second part of the path of its "
+            "array, where --field is a pattern such as 'run/*/tactile'.",
+        ),
+    ] = None
     intervals: Annotated[
         Path | None,
         Option(

@@ -35,7 +35,7 @@ __all__ = [
     "stored_source",
 ]
 
-RECORDINGS = (".bag", ".db3", ".mcap", ".npy", ".csv", ".h5", ".hdf5", ".parquet")
+RECORDINGS = (".bag", ".db3", ".mcap", ".npy", ".npz", ".mat", ".csv", ".h5", ".hdf5", ".parquet", ".feather")
 PACKED = (".part",)  # what is looked for in a remote folder: the names that packed memories have
 WHOLE = ("metadata.yaml", "meta/info.json", ".zgroup", "zarr.json")  # in a folder that is one recording
 
@@ -67,7 +67,7 @@ class SourceOptions:
     annotate: Sequence[str] = ()
     cut: Cut | None = None
     material: str | None = None
-    by: Literal["topic", "file", "folder", "task"] | None = None
+    by: str | None = None
     intervals: Sequence[Interval] | None = None
     quantities: Sequence[Quantity] = ()
 

@@ -55,17 +55,19 @@ class ArraySource(Source):
     """What sources of arrays have in common.
 
     arrays: by name, while the file is open. groups: the names of those that are called alike in several episodes, by
-    what they are called. unread: arrays that cannot be read, and why. tasks: what the numbers
-    in an array task_index stand for. table: whether all are columns of a table, of which a row is a reading.
+    what they are called. clocks: the names of arrays of times, by what stands before them. unread: why arrays cannot be
+    read. tasks: what the numbers in an array task_index stand for. table: whether all are columns of a table,
+    of which a row is a reading. named: whether a pattern found episodes.
     """
 
     labels = annotate = True
-    table = False
+    table = named = False
 
     def __init__(self, *of: Any) -> None:
         super().__init__(*of)
         self.arrays: dict[str, Any] = {}
         self.groups: dict[str, list[str]] = {}
+        self.clocks: dict[str, list[str]] = {}
         self.unread: list[str] = []
         self.tasks: dict[int, str] = {}
 
@@ -80,14 +82,12 @@ class ArraySource(Source):
     @contextmanager
     def _open(self) -> Iterator[None]:
         with self.opened() as self.arrays:
-            groups = defaultdict(list)
-            for name in sorted(
-                self.arrays,
-                key=lambda name: [
-                    (not p.isdecimal(), int(p) if p.isdecimal() else 0, p) for p in re.split(r"(\d+)", name)
-                ],
-            ):
+            groups, clocks = defaultdict(list), defaultdict(list)
+            for name in sorted(self.arrays, key=lambda name: re.sub(r"\d+", lambda part: part[0].zfill(20), name)):
                 groups[self.key(name)].append(name)
+                if is_clock(_last(name)) and self.arrays[name].dtype.kind in "iufM":
+                    clocks[_folder(name)].append(name)
+            self.clocks = dict(clocks)
             self.groups = dict(groups)
             yield
 
@@ -133,7 +133,7 @@ class ArraySource(Source):
             found = [name for own in self.groups.values() for name in own if _pattern(stem).fullmatch(name)]
             found = [name for name in found if self._numeric(name)]
             if len({_folder(name) for name in found}) > 1 or any(len(self.arrays[name].shape) > 1 for name in found):
-                self.paths = dict(enumerate(found))
+                self.named = True
                 return [[name] for name in found], rest, way
         keys = [
             key for part in ([stem] if stem in self.groups else stem.split(",")) for key in self._keys(part.strip())
@@ -187,24 +187,19 @@ class ArraySource(Source):
         """The readings of the arrays that were chosen, episode after episode."""
         with self._open():
             touches, rest, way = self._chosen()
-            clocks, done = defaultdict(list), 0
-            for name, array in self.arrays.items():
-                if is_clock(_last(name)) and array.dtype.kind in "iufM":
-                    clocks[_folder(name)].append(name)
+            done = 0
             for names in touches:
                 columns = [self._readable(name) for name in names]
                 shapes = [tuple(self.arrays[own[0]].shape[2 if way else 1 :]) for own in (touches[0], names)]
                 if shapes[0] != shapes[1]:
                     what = f"is ragged: {names[0]} has readings of {shapes[1]}, those before {shapes[0]}"
                     raise RecordingError(f"{self.address}: {self.field()!r} {what}")
-                near = [name for folder in _folders(names[0]) for name in clocks.get(folder, ())]
-                clock = self._clock(names[0], near, way)
-                alone = len(touches) == 1 or bool(self.paths)
-                fold = self._fold(
-                    names[0], way, known=rest == "[:]" or clock is not None or not alone or _ENDS in self.arrays
-                )
-                about = self._about(names[0], clock, way, fold, done, apart=len(touches) > 1 or bool(self.paths))
-                done = done + 1 if about.episodes is None else int(about.episodes.max(initial=done - 1)) + 1
+                clock = self._clock(names[0], way)
+                fold = self._fold(names[0], way, known=rest == "[:]" or clock is not None)
+                about = self._about(names[0], clock, way, fold, done)
+                last = done if about.episodes is None else int(about.episodes.max(initial=done - 1))
+                self.paths |= {number: names[0] for number in range(done, last + 1) if self.named}
+                done = last + 1
                 for span, readings in self._slabs(columns, fold if way else 0):
                     yield Block(
                         select(readings, rest, names[0]),
@@ -257,7 +252,8 @@ class ArraySource(Source):
         if way and len(shape) < 2:
             raise FieldError(f"field {name!r} of {self.address} has one axis, {list(shape)}; [{way}] needs two")
         picture = len(shape) == 4 and shape[3] == 3 and self.arrays[name].dtype == np.uint8
-        if way or known or self.table or picture or len(shape) < 3 or shape[1] < _FEW:
+        known = known or self.table or _ENDS in self.arrays or (self.key(name) != name and not self.named)
+        if way or known or picture or len(shape) < 3 or shape[1] < _FEW:
             return int(shape[1]) if way else 1
         count, long, width = shape[0], shape[1], math.prod(shape[2:])
         key = self.request.field or name
@@ -268,10 +264,11 @@ class ArraySource(Source):
             argument="field",
         )
 
-    def _clock(self, name: str, near: list[str], way: str) -> str | None:
+    def _clock(self, name: str, way: str) -> str | None:
         """The array of times of another: the one that was requested, or one near it that is called so and as long."""
         shape = self.arrays[name].shape
         if self.request.clock is None:
+            near = (key for folder in _folders(name) for key in self.clocks.get(folder, ()))
             return next((key for key in near if key != name and _fits(self.arrays[key].shape, shape, way)), None)
         key = self._beside(name, self.request.clock, "clock rate")
         if not _fits(self.arrays[key].shape, shape, way) or self.arrays[key].dtype.kind not in "iufM":
@@ -279,7 +276,7 @@ class ArraySource(Source):
             raise RecordingError(f"{self.address}: the times {key!r} are {what}", argument="clock")
         return key
 
-    def _about(self, name: str, clock: str | None, way: str, fold: int, done: int, *, apart: bool) -> Block:
+    def _about(self, name: str, clock: str | None, way: str, fold: int, done: int) -> Block:
         """What is known of each reading of a touch, in a block without readings."""
         about, height = Block(np.empty(0)), self.arrays[name].shape[0]
         if clock is not None:
@@ -295,27 +292,28 @@ class ArraySource(Source):
             about.counters["message"] = self._vector(near["frame_index"]).astype(np.int64)
         for text in self.request.annotate:
             about.annotations[text] = np.repeat(self._annotation(text, name), fold)
-        texts = (
-            [] if self.request.labels is None else self._texts(self._beside(name, self.request.labels, "labels field"))
-        )
+        labels = self.request.labels
+        texts = [] if labels is None else self._texts(self._beside(name, labels, "labels field"))
         if "episode_index" in near and not way and not texts:
             numbers = self._vector(near["episode_index"])
             if not np.isfinite(numbers).all():
                 raise FieldError(f"'episode_index' of {self.address} has rows without a number; expected one in each")
             about.episodes = numbers.astype(np.int64)
             tasks = self._vector(near["task_index"]).tolist() if self.tasks and "task_index" in near else []
-            for episode, task in zip(about.episodes.tolist(), tasks, strict=False):
-                self.names.setdefault(episode, self.tasks.get(int(task), ""))
+            called = {
+                episode: self.tasks.get(task) for episode, task in zip(about.episodes.tolist(), tasks, strict=False)
+            }
+            self.names |= {episode: task for episode, task in called.items() if task is not None}
             return about
         each = np.repeat(np.arange(height), fold) if way == "*" else None
         if _ENDS in self.arrays and not way:
             each = np.searchsorted(self._ends(height), np.arange(height), side="right")
-        about.episodes = self._numbered(height * fold, each, texts, done, apart=apart)
+        if each is None and (self.named or self.key(name) != name) and len(texts) != height:
+            each = np.zeros(height * fold, np.int64)
+        about.episodes = self._numbered(height * fold, each, texts, done)
         return about
 
-    def _numbered(
-        self, count: int, each: _Vector | None, texts: list[str], done: int, *, apart: bool
-    ) -> _Vector | None:
+    def _numbered(self, count: int, each: _Vector | None, texts: list[str], done: int) -> _Vector | None:
         """The episode of each of `count` readings, from `done` on, and what texts call them; None where there is none.
 
         each: the episode of each reading, where the file says so. texts: one for all, one an episode, or one a reading.
@@ -324,7 +322,7 @@ class ArraySource(Source):
             change = np.flatnonzero([True, *(one != other for one, other in zip(texts[1:], texts, strict=False))])
             each, self.continuous = np.repeat(np.arange(len(change)), np.diff([*change, count])), True
             texts = [texts[i] for i in change]
-        if each is None and not (apart or texts):
+        if each is None and not texts:
             return None
         each = np.zeros(count, np.int64) if each is None else each
         several = int(each.max(initial=0)) + 1

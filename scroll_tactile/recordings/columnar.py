@@ -54,16 +54,22 @@ class Columnar(ArraySource):
     @contextmanager
     def opened(self) -> Iterator[dict[str, Any]]:
         """The columns by their names."""
-        yield dict(self.columns(self.path, "", {}))
+        yield dict(self.columns(self.path, "", None))
 
-    def columns(self, path: Path, before: str, shapes: Mapping[str, tuple[int, ...]]) -> Iterator[tuple[str, Any]]:
-        """The columns of a file, which are read when they are asked for. shapes: of an entry, where that is known."""
+    def columns(
+        self, path: Path, before: str, shapes: Mapping[str, tuple[int, ...]] | None
+    ) -> Iterator[tuple[str, Any]]:
+        """The columns of a file, which are read when they are asked for. shapes: of entries, if they are known."""
         if self.path.is_dir():
             require_inside(self.path, path)
         self.stored += stored_bytes(path)
         feather = path.suffix.lower() == ".feather"
         # What the footer holds about columns is not read by pyarrow: where that is damaged, pyarrow ends the process.
-        file = self.arrow.ipc.open_file(str(path)) if feather else self.parquet.ParquetFile(path, pre_buffer=False)
+        file = (
+            self.arrow.ipc.open_file(self.arrow.OSFile(str(path)))
+            if feather
+            else self.parquet.ParquetFile(path, pre_buffer=False)
+        )
         schema, rows = (file.schema, file.count_rows()) if feather else (file.schema_arrow, file.metadata.num_rows)
         groups = [] if feather else [file.metadata.row_group(i) for i in range(file.metadata.num_row_groups)]
         chunks = [group.column(i) for group in groups for i in range(file.metadata.num_columns)]
@@ -75,11 +81,10 @@ class Columnar(ArraySource):
             own = [chunk for chunk in chunks if f"{chunk.path_in_schema}.".startswith(f"{field.name}.")]
             claimed = [8 * math.prod(shape), *(max(one.total_uncompressed_size, 8 * one.num_values) for one in own)]
             load = partial(self._loaded, path, field.name, max(claimed[0], sum(claimed[1:])))
-            known = shapes.get(field.name, ())
             numbers = self.types.is_integer(kind) or self.types.is_floating(kind) or self.types.is_boolean(kind)
             dtype = kind.to_pandas_dtype() if numbers else "M8[ns]" if self.types.is_timestamp(kind) else object
             if numbers and 0 in shape[1:]:  # lists of any length: they are looked at
-                shape = [rows, *known] if known else list(load().shape)
+                shape = list(load().shape) if shapes is None else [rows, *shapes.get(field.name, ())]
             yield before + field.name, HeldArray(tuple(shape), np.dtype(dtype), load, str(field.type))
 
     def _load(self, path: Path, name: str, claimed: int) -> npt.NDArray[Any]:

@@ -12,6 +12,7 @@ import math
 import os
 import re
 import struct
+import zipfile
 from abc import abstractmethod
 from collections import defaultdict
 from collections.abc import Iterator
@@ -36,7 +37,15 @@ _FILTERS = {1: "gzip", 2: "shuffle", 3: "fletcher32", 32000: "lzf"}  # of HDF5, 
 _DEEPEST = 32  # groups within each other
 _FEW = 10  # readings: fewer are no touch
 _LARGE = 1 << 18  # bytes of a chunk, of which deflate could make more than any file may
-_COUNTS = ("index", "axis0", "axis1", "frame_index", "episode_index", "task_index")  # of LeRobot and pandas
+_COUNTS = (
+    "index",
+    "__index_level_0__",
+    "axis0",
+    "axis1",
+    "frame_index",
+    "episode_index",
+    "task_index",
+)  # of LeRobot and pandas
 _ENDS = "meta/episode_ends"
 _Vector = npt.NDArray[Any]
 
@@ -116,7 +125,8 @@ class ArraySource(Source):
     def _numeric(self, name: str) -> bool:
         """Whether an array may hold readings."""
         array, last = self.arrays[name], _last(name)
-        return bool(array.shape) and array.dtype.kind in "biuf" and not is_clock(last) and last not in _COUNTS
+        many = bool(array.shape) and math.prod(array.shape) != 1
+        return many and array.dtype.kind in "biuf" and not is_clock(last) and last not in _COUNTS
 
     def _chosen(self) -> tuple[list[list[str]], str, str]:
         """The names of the arrays of each touch, which stand beside each other; the index behind; how rows fold."""
@@ -145,6 +155,10 @@ class ArraySource(Source):
         if field in self.groups or field in self.arrays or not field.endswith("]"):
             return field, ""
         stem, _, rest = field.rpartition("[")
+        if "[" in stem and stem.rstrip() not in self.arrays:
+            raise FieldError(
+                f"field {field!r:.200}: expected one index such as [0:19] after the name", argument="field"
+            )
         return stem.rstrip(), f"[{rest}"
 
     def _keys(self, part: str) -> list[str]:
@@ -252,11 +266,11 @@ class ArraySource(Source):
         if way and len(shape) < 2:
             raise FieldError(f"field {name!r} of {self.address} has one axis, {list(shape)}; [{way}] needs two")
         picture = len(shape) == 4 and shape[3] == 3 and self.arrays[name].dtype == np.uint8
-        known = known or self.table or _ENDS in self.arrays or (self.key(name) != name and not self.named)
+        known = known or _ENDS in self.arrays or (self.key(name) != name and not self.named)
         if way or known or picture or len(shape) < 3 or shape[1] < _FEW:
             return int(shape[1]) if way else 1
         count, long, width = shape[0], shape[1], math.prod(shape[2:])
-        key = self.request.field or name
+        key = self._split(self.request.field or name)[0]
         raise FieldError(
             f"{name or 'the array'} of {self.address} has the shape {tuple(shape)}: say what its first axis counts. "
             f"field='{key}[*]' reads {count} touches of {long} readings of {width} numbers, field='{key}[:]' {count} "
@@ -428,7 +442,8 @@ class Npy(ArraySource):
         """The array, under no name, or its fields."""
         self.stored = stored_bytes(self.path)
         require_bounded(self.path.stat().st_size, self.stored, self.address)
-        yield dict(_fields("", np.load(self.path, allow_pickle=False)))
+        with self.path.open("rb") as file:
+            yield dict(_fields("", np.lib.format.read_array(file, allow_pickle=False)))
 
 
 class Npz(ArraySource):
@@ -439,11 +454,13 @@ class Npz(ArraySource):
         """The arrays by their names."""
         self.stored = stored_bytes(self.path)
         arrays: dict[str, Any] = {}
-        with np.load(self.path, allow_pickle=False) as file:
-            require_bounded(sum(info.file_size for info in file.zip.infolist()), self.stored, self.address)
-            for name in file.files:
+        with zipfile.ZipFile(self.path) as file:
+            require_bounded(sum(info.file_size for info in file.infolist()), self.stored, self.address)
+            for name in file.namelist():
                 try:
-                    arrays.update(_fields(name, file[name]))
+                    with file.open(name) as member:
+                        array = np.lib.format.read_array(member, allow_pickle=False)
+                    arrays.update(_fields(name.removesuffix(".npy"), array))
                 except ValueError as error:
                     self.unread.append(f"{name}: {error}")
         yield arrays

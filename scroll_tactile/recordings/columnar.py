@@ -85,7 +85,8 @@ class Columnar(ArraySource):
             dtype = kind.to_pandas_dtype() if numbers else "M8[ns]" if self.types.is_timestamp(kind) else object
             if numbers and 0 in shape[1:]:  # lists of any length: they are looked at
                 shape = list(load().shape) if shapes is None else [rows, *shapes.get(field.name, ())]
-            yield before + field.name, HeldArray(tuple(shape), np.dtype(dtype), load, str(field.type))
+            name = "time" if field.name == "__index_level_0__" and dtype == "M8[ns]" else field.name  # pandas' index
+            yield before + name, HeldArray(tuple(shape), np.dtype(dtype), load, str(field.type))
 
     def _load(self, path: Path, name: str, claimed: int) -> npt.NDArray[Any]:
         """A column, shape (rows, …); raises RecordingError for one that is ragged, or larger than its file can hold."""

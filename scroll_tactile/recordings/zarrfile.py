@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scroll_tactile_store.encoding import declared_size
 
 from scroll_tactile.errors import RecordingError
 from scroll_tactile.recordings.arraystores import ArraySource
@@ -132,6 +131,8 @@ def _require_chunk(data: bytes, codecs: list[str], size: int, what: str) -> None
     if "blosc" in codecs or "lz4" in codecs:
         claimed = int.from_bytes(data[4:8] if "blosc" in codecs else data[:4], "little")
     elif "zstd" in codecs:
+        from scroll_tactile_store.encoding import declared_size
+
         try:
             claimed = declared_size(data)
         except ValueError:  # a frame that was streamed does not say its size

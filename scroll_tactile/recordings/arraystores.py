@@ -74,6 +74,7 @@ class ArraySource(Source):
 
     def __init__(self, *of: Any) -> None:
         super().__init__(*of)
+        self.called = self.request.field or ""
         self.arrays: dict[str, Any] = {}
         self.groups: dict[str, list[str]] = {}
         self.clocks: dict[str, list[str]] = {}
@@ -99,6 +100,10 @@ class ArraySource(Source):
             self.clocks = dict(clocks)
             self.groups = dict(groups)
             yield
+
+    def field(self) -> str:
+        """The field that is read; of columns beside each other, their names."""
+        return self.called
 
     def contents(self) -> Contents:
         """The arrays that hold numbers in rows; those of one number a row that make up a table are one entry."""
@@ -135,6 +140,7 @@ class ArraySource(Source):
             if len(listed.entries) != 1 and len(self.groups) != 1:
                 raise listed.refused("expected a field to read")
             field = listed.entries[0].field if listed.entries else next(iter(self.groups))
+        self.called = field
         way = next((way for way in "*+" if f"[{way}]" in field), "")
         stem, rest = self._split(field.replace(f"[{way}]", "", 1) if way else field)
         if stem in self.arrays:
@@ -148,6 +154,7 @@ class ArraySource(Source):
         keys = [
             key for part in ([stem] if stem in self.groups else stem.split(",")) for key in self._keys(part.strip())
         ]
+        self.called = ",".join(keys) if len(keys) > 1 else field
         return [list(names) for names in zip(*(self.groups[key] for key in keys), strict=True)], rest, way
 
     def _split(self, field: str) -> tuple[str, str]:

@@ -122,6 +122,7 @@ def test_columns_of_one_number_a_row_stand_beside_each_other(tmp_path, name):
         recording = read(tmp_path / name, field=field)
         np.testing.assert_array_equal(recording.readings, ROWS)
         np.testing.assert_allclose(recording.times, TIMES)
+        assert [name.rpartition(".")[2] for name in recording.field.split(",")] == list("abcd")
     prefix = "log/table." if name == "c.h5" else ""  # a pattern is of the whole path
     np.testing.assert_array_equal(read(tmp_path / name, field=f"{prefix}?").readings, ROWS)
     np.testing.assert_array_equal(read(tmp_path / name, field="d,a").readings, ROWS[:, [3, 0]])

@@ -217,7 +217,13 @@ def test_experiments_in_groups_are_episodes_named_by_a_part_of_their_path(groups
     for by in ("group:0", "group:5"):
         with pytest.raises(InputError, match=f"has no {by} to be named by: readings 0 to 30 lie in run/felt/1/tactile"):
             touches(recording, "episodes", by)
-    with pytest.raises(InputError, match="lie in no groups that a pattern found"):
+    numbers = read(groups, field="run/oak/*/tactile")
+    with pytest.raises(
+        InputError, match=r"has no folder to be named by: .* expected by='group:1', run, by='group:2', oak"
+    ):
+        touches(numbers, "episodes", "folder")
+    assert {touch.material for touch in touches(numbers, "episodes", "group:2")} == {"oak"}
+    with pytest.raises(InputError, match="lie in no groups that a pattern as"):
         touches(read(groups, field="run/oak/1/tactile"), "whole", "group:2")
     with pytest.raises(FieldError, match=r"no field 'run/\*/skin'"):
         read(groups, field="run/*/skin")

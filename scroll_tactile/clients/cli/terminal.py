@@ -96,8 +96,8 @@ class Named(Reading):
         str | None,
         Option(
             "--label-by",
-            help="What names each touch: file, folder, topic or task; or group:2, the second part of the path of its "
-            "array, where --field is a pattern such as 'run/*/tactile'.",
+            help="What names each touch: file, folder, topic or task; folder:2, the second below the one typed; or "
+            "group:2, the second part of the path of its array, where --field is a pattern such as 'run/*/tactile'.",
         ),
     ] = None
     intervals: Annotated[
@@ -116,8 +116,8 @@ class Named(Reading):
         Cut | None, Option(help="Where touches begin and end; without it by intervals or episodes if there are any.")
     ] = None
 
-    def of(self, found: Sequence[str]) -> SourceOptions:
-        """How these recordings are read, cut and named. Raises InputError for options that do not fit together."""
+    def options(self) -> SourceOptions:
+        """How recordings are read, cut and named. Raises InputError for options that do not fit together."""
         from scroll_tactile.clients.learning.sources import SourceOptions
         from scroll_tactile.recordings import declared_quantities, read_intervals
 
@@ -126,7 +126,7 @@ class Named(Reading):
         if self.intervals is not None:
             if self.labels is not None:
                 raise InputError("give --labels or --label-topic: both say where touches begin")
-            given["intervals"] = tuple(read_intervals(self.intervals, found))
+            given["intervals"] = tuple(read_intervals(self.intervals))
             given["quantities"] = tuple(declared_quantities(self.intervals))
             if not given["intervals"]:
                 raise InputError(f"expected touches in {self.intervals}, one row each; there are none")

@@ -495,10 +495,17 @@ class Hdf5(ArraySource):
         def visit(name: str, item: Any) -> None:
             if name.count("/") > _DEEPEST:
                 raise RecordingError(f"{self.address} has more than {_DEEPEST} groups within each other")
-            if isinstance(item, h5py.Dataset) and item.shape is not None and not name.startswith("#"):
+            if not isinstance(item, h5py.Dataset) or item.shape is None or name.startswith("#"):
+                return
+            if item.dtype.kind == "O" and h5py.check_string_dtype(item.dtype) is None:
+                self.unread.append(f"{name} holds references to others, as cells of MATLAB 7.3 do: save them with -v7")
+            elif not self.turned:
+                arrays.update(_fields(name, item))
+            elif item.attrs.get("MATLAB_class") == b"char" and item.size < _LARGE:
+                arrays[name] = np.array("".join(map(chr, item[()].T.flat)))
+            else:
                 shape = _vectors(item.shape[::-1])
-                turned = HeldArray(shape, item.dtype, lambda: item[()].T.reshape(shape), source=item)
-                arrays.update(_fields(name, turned if self.turned else item))
+                arrays[name] = HeldArray(shape, item.dtype, lambda: item[()].T.reshape(shape), source=item)
 
         try:
             file = h5py.File(self.path, "r")
@@ -507,7 +514,7 @@ class Hdf5(ArraySource):
                 raise
             raise RecordingError(
                 f"{self.address} is being written: another program has it open. Read it once that has closed it; where "
-                f"none has, h5clear -s {self.path.name} says that its writer is gone"
+                f"none has, h5clear -s {self.path.name} says that its writer is gone. ({error})"
             ) from error
         with file:
             file.visititems(visit)  # which follows neither soft nor external links

@@ -8,6 +8,7 @@ nobody's harm.
 
 from __future__ import annotations
 
+import json
 import os
 import stat
 import zlib
@@ -156,4 +157,4 @@ def read_text(folder: Path, path: Path, most: int) -> str:
         data = file.read(most + 1)
     if len(data) > most:
         raise RecordingError(f"{path} has more than {most} bytes; expected less of what describes a recording")
-    return data.decode()
+    return data.decode(json.detect_encoding(data))

@@ -187,8 +187,15 @@ def test_structs_and_cells_of_matlab(tmp_path):
     np.testing.assert_allclose(recording.times[10:], TIMES[:11])
     assert len(read(tmp_path / "a.mat", field="d.trial[1].tactile")) == 11
     assert [e.begin for e in read(tmp_path / "a.mat", field="cells").episodes] == [0, 5]
-    matlab(tmp_path / "b.mat", **{"d.skin": ROWS, "d.t": TIMES[:, None]})
-    np.testing.assert_allclose(read(tmp_path / "b.mat", field="skin").times, TIMES)
+    matlab(tmp_path / "b.mat", **{"d.skin": ROWS, "d.t": TIMES[:, None], "d.name": np.array([[*b"felt"]], np.uint16)})
+    with h5py.File(tmp_path / "b.mat", "a") as file:
+        file["d/name"].attrs["MATLAB_class"] = np.bytes_("char")
+        file.create_dataset("cells", data=[file["d/skin"].ref], dtype=h5py.ref_dtype)
+    recording = read(tmp_path / "b.mat", labels="name")
+    np.testing.assert_allclose(recording.times, TIMES)
+    assert (recording.field, recording.episodes[0].name) == ("d/skin", "felt")
+    with pytest.raises(FieldError, match=r"not read: cells holds references to others, as cells of MATLAB 7.3 do"):
+        read(tmp_path / "b.mat", field="cells")
 
 
 @pytest.fixture

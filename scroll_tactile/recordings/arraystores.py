@@ -321,10 +321,9 @@ class ArraySource(Source):
                 raise FieldError(f"'episode_index' of {self.address} has rows without a number; expected one in each")
             about.episodes = numbers.astype(np.int64)
             tasks = self._vector(near["task_index"]).tolist() if self.tasks and "task_index" in near else []
-            called = {
-                episode: self.tasks.get(task) for episode, task in zip(about.episodes.tolist(), tasks, strict=False)
-            }
-            self.names |= {episode: task for episode, task in called.items() if task is not None}
+            for episode, task in zip(about.episodes.tolist(), tasks, strict=False):
+                if task in self.tasks:
+                    self.names.setdefault(episode, self.tasks[task])
             return about
         each = np.repeat(np.arange(height), fold) if way == "*" else None
         if _ENDS in self.arrays and not way:
@@ -359,13 +358,15 @@ class ArraySource(Source):
     def _texts(self, key: str, values: _Vector | None = None) -> list[str]:
         """What an array of labels says, or values of it; of whole numbers where some are missing floats were made."""
         array = self.arrays[key]
-        text = array.dtype.kind == "O" and getattr(array, "said", "string") in ("string", "large_string")
-        if array.dtype.kind not in "biuSU" and not text:
+        texts = array.dtype.kind == "O" and getattr(array, "said", "string") in ("string", "large_string")
+        if array.dtype.kind not in "biuSU" and not texts:
             said = getattr(array, "said", "") or array.dtype
             raise FieldError(f"{self.key(key)!r} of {self.address} holds {said}; expected texts, or whole numbers")
         values = self._vector(key) if values is None else values
-        found = [one.decode(errors="replace") if isinstance(one, bytes) else one for one in values.tolist()]
-        found = ["" if one is None or str(one) == "nan" else str(one).removesuffix(".0").strip() for one in found]
+        found = []
+        for one in values.tolist():
+            text = one.decode(errors="replace") if isinstance(one, bytes) else "" if one is None else str(one)
+            found.append(("" if text == "nan" else text.removesuffix(".0")) if isinstance(one, float) else text.strip())
         if (longest := max(map(len, found), default=0)) > LONGEST_NAME:
             what = f"has a text of {longest} characters; expected labels of at most {LONGEST_NAME}"
             raise FieldError(f"{self.key(key)!r} of {self.address} {what}")

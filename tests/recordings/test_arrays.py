@@ -155,9 +155,9 @@ def test_times_and_labels_of_a_stack(tmp_path):
     np.testing.assert_allclose(recording.times, np.tile(TIMES, 3))
     with pytest.raises(FieldError, match=r"'t' of .* holds float64"):
         read(tmp_path / "a.npz", field="x[*]", labels="t")
-    npz(tmp_path / "b.npz", x=ROWS, t=TIMES, what=np.repeat(["felt", "", "oak"], 10), number=np.repeat([7, 8], 15))
+    npz(tmp_path / "b.npz", x=ROWS, t=TIMES, what=np.repeat(["felt 1.0", "", "oak"], 10), number=np.repeat([7, 8], 15))
     recording = read(tmp_path / "b.npz", field="x", labels="what")
-    assert [(e.begin, e.name) for e in recording.episodes] == [(0, "felt"), (10, None), (20, "oak")]
+    assert [(e.begin, e.name) for e in recording.episodes] == [(0, "felt 1.0"), (10, None), (20, "oak")]
     assert recording.report.backward == 0
     assert [e.name for e in read(tmp_path / "b.npz", field="x", labels="number").episodes] == ["7", "8"]
     with pytest.raises(RecordingError, match="no field 'when'"):

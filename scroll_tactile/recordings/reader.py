@@ -46,18 +46,20 @@ def read(
 ) -> Recording:
     """All readings of a file, or of a folder that is one recording.
 
-    path: a ROS 1 `.bag`; a ROS 2 `.db3` or `.mcap`, or the folder of a bag; a LeRobotDataset v3; robomimic's HDF5; a
-        Zarr replay buffer; `.npy`; `.csv`. Bags in a folder whose names differ in a last number alone are one that was
+    path: a ROS 1 `.bag`; a ROS 2 `.db3` or `.mcap`, or the folder of a bag; a LeRobotDataset v2 or v3; `.parquet`
+        and `.feather`; HDF5, as robomimic's; a Zarr replay buffer; `.npy`, `.npz` and `.mat`; `.csv`. Bags in a folder whose names differ in a last number alone are one that was
         split. On this machine, or an address that fsspec knows.
     topic, field: where the numbers are. Of messages `field` is a path such as `tactiles[0].electrodes`, see `paths`; of
-        tables it names columns (`e1:e19`, `e*`, `a,b`), of others an array, with an index behind it (`[0:19]`).
+        tables it names columns (`e1:e19`, `e*`, `a,b`), of others an array, with an index behind it (`[0:19]`); arrays
+        that a pattern finds in several groups (`run/*/tactile`), and entries of a stack (`x[*]`), are episodes, see
+        `arraystores`.
     clock: "device", "header", "publish" or "log"; or a field, column or array with times. Without it the first of these
         that runs; see `Report`.
     columns: those of the readings that are taken, by their places from 0, such as "25:44" or "0,3,5:9".
     preset: a known sensor, in place of topic and field, see `presets`; of a file without topics it is only the sensor.
     rate: in Hz, counts times where a file has no clock.
-    labels: a topic with texts, or a column: what they say become episodes.
-    annotate: columns of a LeRobotDataset that say something of touches, as headings such as "force [N]" or
+    labels: a topic with texts, a column, or an array of one text, one an episode, or one a reading: they name episodes.
+    annotate: columns or arrays that say something of touches, as headings such as "force [N]" or
         "slip [label]", with " from observation.wrench[2]" behind it where the data set calls it otherwise; they become
         `annotations`.
     resample: a rate in Hz; see `resampled` for the rule. Readings are left as they are without it.

@@ -54,8 +54,8 @@ StreamFile = Annotated[
 Sources = Annotated[
     list[str],
     Argument(
-        help="Recordings, or folders of them: .npy, .csv, .bag, .db3, .mcap, .h5, .zarr, LeRobot data sets, "
-        "and addresses such as s3://…",
+        help="Recordings, or folders of them: .npy, .npz, .mat, .csv, .parquet, .bag, .db3, .mcap, .h5, .zarr, LeRobot "
+        "data sets, and addresses such as s3://…",
         show_default=False,
     ),
 ]
@@ -123,7 +123,8 @@ class Named(Timed):
         str | None,
         Option(
             "--label-by",
-            help="What names each touch: file, folder, topic or task; or folder:2, the second below the one typed.",
+            help="What names each touch: file, folder, topic or task; folder:2, the second below the one typed; or "
+            "group:2, the second part of the path of its array, where --field is a pattern such as 'run/*/tactile'.",
         ),
     ] = None
     intervals: Annotated[

@@ -42,7 +42,7 @@ __all__ = [
     "stored_source",
 ]
 
-RECORDINGS = (".bag", ".db3", ".mcap", ".npy", ".csv", ".h5", ".hdf5", ".parquet")
+RECORDINGS = (".bag", ".db3", ".mcap", ".npy", ".npz", ".mat", ".csv", ".h5", ".hdf5", ".parquet", ".feather")
 PACKED = (".part",)  # what is looked for in a remote folder: the names that packed memories have
 _LOOKED = 3  # sources are looked at for the names of columns
 WHOLE = ("metadata.yaml", "meta/info.json", ".zgroup", "zarr.json")  # in a folder that is one recording
@@ -98,10 +98,9 @@ class SourceOptions:
                 "touches can be named in one way: by one of material=, by= and intervals=",
                 argument="material by intervals",
             )
-        if self.by is not None and self.by not in _BY and _FOLDER.fullmatch(self.by) is None:
-            raise InputError(
-                f"expected by={', '.join(map(repr, _BY))} or 'folder:2'; came {self.by!r:.60}", argument="by"
-            )
+        if self.by is not None and self.by not in _BY and re.fullmatch(r"(folder|group):\d{1,4}", self.by) is None:
+            expected = ", ".join(map(repr, _BY))
+            raise InputError(f"expected by={expected}, 'folder:2' or 'group:2'; came {self.by!r:.60}", argument="by")
         if self.material is not None:
             require_name(self.material)
         if self.preset is not None:

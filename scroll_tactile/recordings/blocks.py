@@ -34,7 +34,7 @@ class Request:
     labels: str | None = None
     header: bool | None = None
     delimiter: str | None = None
-    decimal: str = "."
+    decimal: str | None = None
     likely: str | None = None  # the topic, where several have the field
     definitions: Mapping[str, str] = dataclasses.field(default_factory=dict)
     annotate: tuple[str, ...] = ()

@@ -41,7 +41,7 @@ def read(
     resample: float | None = None,
     header: bool | None = None,
     delimiter: str | None = None,
-    decimal: str = ".",
+    decimal: str | None = None,
     definitions: Mapping[str, str] | None = None,
 ) -> Recording:
     """All readings of a file, or of a folder that is one recording.
@@ -93,7 +93,7 @@ def iterate(
     labels: str | None = None,
     header: bool | None = None,
     delimiter: str | None = None,
-    decimal: str = ".",
+    decimal: str | None = None,
     definitions: Mapping[str, str] | None = None,
 ) -> Iterator[Recording]:
     """The readings of a file block by block, as recordings of at most 4096 readings: for files beyond memory.

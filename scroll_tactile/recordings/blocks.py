@@ -136,6 +136,11 @@ class Source(ABC):
         self.names: dict[int, str] = {}
         self.marks: list[tuple[float, str]] = []
 
+    @classmethod
+    def holds_some(cls, path: Path) -> bool:
+        """Whether a file in a folder is a recording, where its name alone does not say so; `find` asks."""
+        return True
+
     def field(self) -> str:
         """The field that is read, as far as it is known before reading."""
         return self.request.field or ""

@@ -6,6 +6,7 @@ import fnmatch
 import itertools
 import re
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +15,11 @@ import numpy.typing as npt
 from scroll_tactile.errors import FieldError, RecordingError, ScrollTactileError
 from scroll_tactile.recordings.blocks import Block, Contents, Entry, Request, rows_of
 from scroll_tactile.recordings.paths import nearest
-from scroll_tactile.recordings.text import LONGEST, Layout, Text, in_seconds, is_time, moment, number, usual
+from scroll_tactile.recordings.text import FEWEST, LONGEST, Layout, Text, in_seconds, is_time, moment, number, usual
 
-__all__ = ["LONGEST", "Delimited", "holds_numbers", "is_table"]
+__all__ = ["LONGEST", "SUFFIXES", "Delimited"]
+
+SUFFIXES = (".csv", ".tsv", ".txt", ".dat")
 
 _MOST_COLUMNS = 1 << 18  # a picture of 320 × 240 in three colours has 230 400
 _SEEN, _SEEN_TEXT = 200, 1 << 20  # lines, and characters of them, are looked at to say what a table is
@@ -30,11 +33,6 @@ _UNIT = re.compile(
 _BLANK = dict.fromkeys(("", " ", "NA", "N/A", "#N/A", "null", "None", "-", "-nan(ind)", "\n", "\t"), "nan")
 
 Floats = npt.NDArray[np.float64]
-
-
-def is_table(path: Path) -> bool:
-    """Whether a file's name is that of a table of text."""
-    return path.suffix.lower() in (".csv", ".tsv", ".txt", ".dat")
 
 
 class Delimited(Text):
@@ -63,6 +61,16 @@ class Delimited(Text):
         if self.width > _MOST_COLUMNS:
             raise RecordingError(f"{address} has {self.width} columns; expected at most {_MOST_COLUMNS}")
         self._understand(rows)
+
+    @classmethod
+    def holds_some(cls, path: Path) -> bool:
+        """Whether it is a table of numbers, where it may be any text by its name."""
+        if path.suffix.lower() in SUFFIXES[:2]:
+            return True
+        with suppress(ScrollTactileError, StopIteration, OSError):
+            table = cls(path, str(path), Request())
+            return table.numbers == table.chosen and len(next(table.blocks()).readings) >= FEWEST
+        return False
 
     def field(self) -> str:
         """The columns that are read."""
@@ -175,7 +183,7 @@ class Delimited(Text):
         if None not in found:
             return found  # type: ignore[return-value]
         place = [*self.chosen, self.time or 0][found.index(None)]
-        hint, argument = "", None
+        hint, argument = "", ""
         if self.request.field is None and self.numbers and place not in (*self.numbers, self.time):
             first, last = self.numbers[0], self.numbers[-1]
             names = [self.columns[i] for i in self.numbers]
@@ -183,7 +191,7 @@ class Delimited(Text):
             hint = f". Name the columns with numbers by field={field!r:.200}, or the column of labels by labels="
             argument = "field labels"
         what = f"expected a number; came {cells[place].strip()!r:.60}{hint}"
-        raise self._error(row, f", column {place + 1} ({self.columns[place]}): {what}", argument)
+        raise self._error(row, f", column {place + 1} ({self.columns[place]}): {what}", argument or None)
 
     def _is_half(self, cell: str) -> bool:
         """Whether the last cell of a line without an end is cut: empty, a sign, or shorter than that of any other."""
@@ -323,12 +331,3 @@ def _are_units(cells: list[str]) -> bool:
     """Whether all cells are units of measurement, in brackets or known ones."""
     texts = [cell.strip() for cell in cells if cell.strip()]
     return bool(texts) and all(map(_UNIT.fullmatch, texts))
-
-
-def holds_numbers(path: Path) -> bool:
-    """Whether a file of text is a table of numbers, as `find` asks of files whose names do not say it."""
-    try:
-        table = Delimited(path, str(path), Request())
-        return len(table.numbers) == len(table.chosen) and len(next(table.blocks()).readings) > 1
-    except (ScrollTactileError, StopIteration, OSError):
-        return False

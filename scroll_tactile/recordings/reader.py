@@ -131,8 +131,8 @@ def describe(path: _Address, *, definitions: Mapping[str, str] | None = None) ->
 def find(path: _Address) -> list[Path]:
     """The recordings in a local folder and the folders inside it, in the order of their names.
 
-    A file is a recording by its suffix (`.txt` and `.dat` only where they are named themselves), and so is a folder
-    that says it is one, as a ROS 2 bag does by its metadata.yaml. Bags beside each other are recordings of their own,
+    A file is a recording by its suffix (`.txt`, `.dat` and `.json` where they hold readings), and so is a folder that
+    says it is one, as a ROS 2 bag does by its metadata.yaml. Bags beside each other are recordings of their own,
     however they are numbered; `read` takes their folder as one that was split. Raises RecordingError for a path where
     nothing is.
     """
@@ -154,7 +154,7 @@ def _found(place: Path, depth: int) -> list[Path]:
             continue  # it may lead back here
         if inside.is_dir() and not inside.name.startswith("."):
             found += _found(inside, depth + 1) if depth < _DEEPEST else []
-        elif inside.suffix.lower() not in (".txt", ".dat") and _kind(inside) is not None:
+        elif (kind := _kind(inside)) is not None and kind.holds_some(inside):
             found.append(inside)
     return found
 
@@ -192,7 +192,7 @@ def _open(path: Path, address: str, request: Request, preset: str | None = None)
 
 
 def _kind(path: Path) -> type[Source] | None:
-    from scroll_tactile.recordings import arraystores, delimited, lerobot, rosbag, zarrfile
+    from scroll_tactile.recordings import arraystores, delimited, jsonfile, lerobot, rosbag, zarrfile
 
     if rosbag.is_rosbag(path):
         return rosbag.RosBag
@@ -201,11 +201,13 @@ def _kind(path: Path) -> type[Source] | None:
     if zarrfile.is_zarr(path):
         return arraystores.ZarrBuffer
     suffix = "" if path.is_dir() else path.suffix.lower()
-    if suffix in (".h5", ".hdf5", ".hdf"):
-        return arraystores.Hdf5
-    if suffix and delimited.is_table(path):
-        return delimited.Delimited
-    return arraystores.Npy if suffix == ".npy" else None
+    readers: dict[type[Source], tuple[str, ...]] = {
+        arraystores.Hdf5: (".h5", ".hdf5", ".hdf"),
+        arraystores.Npy: (".npy",),
+        delimited.Delimited: delimited.SUFFIXES,
+        jsonfile.JsonFile: jsonfile.SUFFIXES,
+    }
+    return next((reader for reader, suffixes in readers.items() if suffix in suffixes), None)
 
 
 def _timed(source: Source, request: Request) -> Iterator[Block]:

@@ -23,14 +23,22 @@ from scroll_tactile.errors import RecordingError, ScrollTactileError, printable
 from scroll_tactile.recordings.blocks import Request, Source
 from scroll_tactile.recordings.bounds import require_file
 
-__all__ = ["LONGEST", "Layout", "Text", "in_seconds", "is_time", "moment", "number", "usual"]
+__all__ = ["FEWEST", "LONGEST", "Layout", "Text", "in_seconds", "is_time", "moment", "number", "usual"]
 
 LONGEST = 1 << 24
 """Characters in a line; a longer one is no table's."""
 
+FEWEST = 8
+"""Readings in a file that is a recording, where its name does not say so."""
+
 _FEW = 100  # one row in so many may be left out
 _PIECE = 1 << 20  # bytes that are decoded at once
-_OTHERS = {b"PK\x03\x04": "an archive or a workbook (.xlsx)", b"\xd0\xcf\x11\xe0": "a workbook", b"\x1f\x8b": "gzip"}
+_OTHERS = {
+    b"PK\x03\x04": "an archive or a workbook (.xlsx): save it as text",
+    b"\xd0\xcf\x11\xe0": "a workbook (.xls): save it as text",
+    b"\x1f\x8b": "compressed by gzip: unpack it",
+    b"version https://git-lfs": "a pointer of Git LFS in place of the file: `git lfs pull` brings it",
+}
 _MISSING = re.compile(
     r"|-|\?|missing|<na>|null|none|n/?a|#n/?a|#nv|#(?:value|num|ref|div/0)!|-?nan(?:\(s?nan\)|\(ind\))?|"
     r"-?1\.#(?:qnan|snan|ind)0*",
@@ -159,21 +167,25 @@ class Text(Source):
     def __init__(self, path: Path, address: str, request: Request) -> None:
         super().__init__(path, address, request)
         self._before = require_file(path)
-        self.budget.add(self._before.st_size)
+        self.size = self._before.st_size
+        self.budget.add(self.size)
         with path.open("rb") as file:
             head = file.read(4096)
         if (what := next((what for begin, what in _OTHERS.items() if head.startswith(begin)), None)) is not None:
-            raise RecordingError(f"{address} is {what}; expected text: save or unpack it as such")
+            raise RecordingError(f"expected text in {address}; it is {what}")
         self.encoding, self._guess = _encoding_of(head)
+        self._begin()
+
+    def _begin(self) -> None:
         self.unended = self.seen = self.empty = self._left_out = 0
-        self.ending = ""
-        self._first: ScrollTactileError | None = None
+        self.ending = self.counted = ""
+        self.first: ScrollTactileError | None = None
 
     def pieces(self) -> Iterator[str]:
         """The text, as far as the file went when it was opened."""
         errors = "replace" if self.encoding.startswith("utf-16") else "surrogateescape"
         decoder = io.IncrementalNewlineDecoder(codecs.getincrementaldecoder(self.encoding)(errors), translate=True)
-        left = self._before.st_size
+        left = self.size
         with self.path.open("rb") as file:
             while left > 0 and (data := file.read(min(left, _PIECE))):
                 left -= len(data)
@@ -181,6 +193,7 @@ class Text(Source):
 
     def lines(self) -> Iterator[tuple[int, str]]:
         """The lines that are not blank, with their numbers. Raises RecordingError for one that is longer than any."""
+        self._begin()
         row, rest, zeros = 0, "", False
         for piece in filter(None, self.pieces()):
             zeros = piece[-1] == "\0"
@@ -204,12 +217,12 @@ class Text(Source):
             self.ending = f"it ends in the middle of row {row}"
             return
         self._left_out += 1
-        self._first = self._first or error
+        self.first = self.first or error
 
     def require_few(self) -> None:
         """Raises the error of the first row that was left out where more than a hundredth were."""
-        if self._first is not None and self._left_out * _FEW > self.seen:
-            raise self._first
+        if self.first is not None and self._left_out * _FEW > self.seen:
+            raise self.first
 
     def finish(self) -> None:
         """Note what was odd, after the last row. Raises RecordingError for a file that was changed meanwhile."""
@@ -218,10 +231,12 @@ class Text(Source):
         if now.st_ino != before.st_ino or not (same or now.st_size > before.st_size):
             raise RecordingError(f"{self.address} was changed while it was read: read it when nothing writes to it")
         self.cut_off = bool(self.ending)
+        first = str(self.first).removeprefix(f"{self.address}, ")
         said = (
             (self._guess, f"its encoding is guessed: {self._guess}"),
+            (self.counted, self.counted),
             (self.ending, self.ending),
-            (self._left_out, f"{self._left_out} of {self.seen} rows are left out, the first by this: {self._first}"),
+            (self._left_out, f"{self._left_out} of {self.seen} rows are left out, the first by this: {first}"),
             (self.empty, f"{self.empty} rows have no number at all"),
             (not same, f"it grew while it was read: what came behind its first {before.st_size} bytes is left out"),
         )

@@ -86,6 +86,12 @@ class Reading:
     field: Annotated[str | None, Option(help="The path to the numbers, such as 'tactiles[0].electrodes'.")] = None
     clock: Annotated[str | None, Option(help="device, header, publish or log; or a field, column or array.")] = None
     columns: Columns = None
+    delimiter: Annotated[
+        str | None, Option(help="What separates the cells of a table, such as ';' or tab, where it does not show.")
+    ] = None
+    decimal: Annotated[
+        str | None, Option(help="The decimal mark of a table's numbers, '.' or ',', where it does not show.")
+    ] = None
 
 
 @dataclass(frozen=True)

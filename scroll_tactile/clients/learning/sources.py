@@ -46,8 +46,8 @@ Cut = Literal["episodes", "intervals", "none", "contact"]
 class SourceOptions:
     """How sources are read, cut into touches, and named.
 
-    topic, field, clock, columns, preset, labels, annotate: as of `recordings.read`. cut: None cuts by the intervals
-    where there are some, by episodes where a recording has some, and not otherwise.
+    topic, field, clock, columns, delimiter, decimal, preset, labels, annotate: as of `recordings.read`.
+    cut: None cuts by the intervals where there are some, by episodes where a recording has some, and not otherwise.
     material: the name of all touches. by: what names each touch, as of `recordings.touches`. intervals: the table's.
     At most one of the three names them; without any, episodes name themselves. quantities: that are declared before
     anything is learned, as the table's headings do (`recordings.declared_quantities`), beside those of `annotate`.
@@ -62,6 +62,8 @@ class SourceOptions:
     field: str | None = None
     clock: str | None = None
     columns: str | None = None
+    delimiter: str | None = None
+    decimal: str | None = None
     preset: str | None = None
     labels: str | None = None
     annotate: Sequence[str] = ()
@@ -111,6 +113,8 @@ class SourceOptions:
             field=self.field,
             clock=self.clock,
             columns=self.columns,
+            delimiter=self.delimiter,
+            decimal=self.decimal,
             preset=self.preset,
             rate=learner.sensor.rate,  # where it has no clock
             labels=self.labels,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import fnmatch
 import itertools
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -74,7 +74,7 @@ class Delimited(Text):
 
     def field(self) -> str:
         """The columns that are read."""
-        return self.request.field or ",".join(self.columns[i] for i in self.chosen)
+        return ",".join(self.columns[i] for i in self.chosen)
 
     def contents(self) -> Contents:
         """The columns as one entry."""
@@ -116,7 +116,7 @@ class Delimited(Text):
         clocks = {}
         if self.time is not None:
             name, unit = self.columns[self.time], self.units[self.time]
-            clocks = {} if self.coarse else {name: in_seconds(table[:, -1], name, unit)}
+            clocks = {name: in_seconds(table[:, -1], name, unit)}
             table = table[:, :-1]
         self.empty += int(np.isnan(table).all(axis=1).sum())
         return Block(table, clocks, {}, self._episodes([cells for _, cells in rows]))
@@ -194,8 +194,8 @@ class Delimited(Text):
         raise self._error(row, f", column {place + 1} ({self.columns[place]}): {what}", argument or None)
 
     def _is_half(self, cell: str) -> bool:
-        """Whether the last cell of a line without an end is cut: empty, a sign, or shorter than that of any other."""
-        return cell.strip() in ("", "-", "+") or len(cell) < self.shortest
+        """Whether the last cell of a line without an end is cut: empty, a sign, or of fewer decimals than others."""
+        return cell.strip() in ("", "-", "+") or len(cell.strip().partition(self.layout.decimal)[2]) < self.tail
 
     def _error(self, row: int, what: str, argument: str | None = None) -> RecordingError:
         return RecordingError(f"{self.address}, row {row}{what}", argument=argument)
@@ -251,25 +251,27 @@ class Delimited(Text):
         self._assign(data, numeric)
 
     def _assign(self, data: list[list[str]], numeric: list[bool]) -> None:
-        """Which columns are times, an index, labels and readings, by the first rows of numbers."""
-        timed = (i for i, name in enumerate(self.columns) if self.header and is_time(name))
-        self.time = next(timed, None) if self.request.clock is None else self._column(self.request.clock)
+        """Which columns are times, labels and readings, by the first rows of numbers; others are left out."""
         own = data[:-1] if self.unended else data
-        self.shortest = min((len(cells[self.width - 1]) for cells in own), default=0) if len(own) > 20 else 0
-        self.index = next((i for i, name in enumerate(self.columns) if self._is_index(i, name, own)), None)
-        if self.index is not None and self.columns[self.index] not in ("", "index", "Unnamed: 0"):
-            self.notes.append(f"column {self.columns[self.index]!r} counts the rows, and is left out")
-        self.coarse = False
-        if self.time is not None and self.request.clock is None and len(own) > 8:
-            found = [moment(cells[self.time], self.layout.decimal) for cells in own]
-            stamps = in_seconds(np.array(found, np.float64), self.columns[self.time], self.units[self.time])
-            still = np.count_nonzero(np.diff(stamps) == 0)
-            self.coarse = bool(2 * still >= len(stamps) - 1 and (stamps == np.round(stamps)).all())
-            if self.coarse:
-                name = self.columns[self.time]
-                self.notes.append(f"column {name!r} is no clock: it has whole seconds, the same for several rows")
+        last = [cells[self.width - 1].strip() for cells in own] if len(own) > FEWEST else [""]
+        self.tail = usual([cell.partition(self.layout.decimal)[2] for cell in last])  # decimals of the last column
+        self.time = None if self.request.clock is None else self._column(self.request.clock)
+        apart = []
+        for i, name in enumerate(self.columns if self.header else []):
+            if is_time(name):
+                told = sum(moment(cells[i], self.layout.decimal) is not None for cells in own)
+                if self.time is None and 2 * told >= len(own):
+                    self.time = i
+                else:
+                    apart.append(i)
+            elif re.split("[./]", name.lower())[-1] in _COUNTS and _count(cells[i] for cells in own):
+                apart.append(i)
         self.label = None if self.request.labels is None else self._column(self.request.labels)
-        rest = [i for i in range(self.width) if i not in (self.time, self.index, self.label)]
+        if said := [
+            self.columns[i] for i in apart if self.columns[i] not in ("", "index", "Unnamed: 0") and i != self.time
+        ]:
+            self.notes.append(f"left out, as they count or are further times: {', '.join(said)}")
+        rest = [i for i in range(self.width) if i not in (self.time, self.label, *apart)]
         self.numbers = [i for i in rest if numeric[i]]
         self.chosen = self._chosen(rest)
         self.wanted = self.chosen if self.time is None else [*self.chosen, self.time]
@@ -289,12 +291,6 @@ class Delimited(Text):
         counted = bool(numbers) and numbers == [str(i) for i in range(len(numbers))]
         unlike = not data[0][0].strip() or any("." in cell for cell in (data[1] if len(data) > 1 else []))
         return counted and (len(numbers) >= 3 or unlike)
-
-    def _is_index(self, place: int, name: str, data: list[list[str]]) -> bool:
-        cells = [cells[place].strip() for cells in data]
-        if not self.header or place == self.time or name.lower() not in _COUNTS or not cells or not cells[0].isdigit():
-            return False
-        return cells == [str(int(cells[0]) + i) for i in range(len(cells))]
 
     def _column(self, name: str) -> int:
         for each in (name, name.lstrip("#% "), self.named(name)):
@@ -325,6 +321,12 @@ class Delimited(Text):
                 f"{self.address}: field {self.request.field!r} names no column, or the last before the first"
             )
         return chosen
+
+
+def _count(cells: Iterable[str]) -> bool:
+    """Whether each cell is one more than that before."""
+    found = [cell.strip() for cell in cells]
+    return bool(found) and found[0].isdigit() and found == [str(int(found[0]) + i) for i in range(len(found))]
 
 
 def _are_units(cells: list[str]) -> bool:

@@ -128,7 +128,8 @@ class Recording:
     def cure(self, sensor: Sensor) -> str:
         """What to do where these are not the sensor's readings."""
         wider = self.readings.ndim == 2 and self.readings.shape[1] > sensor.channels
-        some = f" Some of its columns are taken by columns='0:{sensor.channels}'" if wider else ""
+        low = int(wider and len(self) > 1 and bool((np.diff(self.readings[:, 0]) > 0).all()))  # rises as times do
+        some = f" Some of its columns are taken by columns='{low}:{low + sensor.channels}'" if wider else ""
         return f"Is it another sensor's recording, or another field?{some}"
 
     def stream(self, sensor: Sensor) -> Stream:

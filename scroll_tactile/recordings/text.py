@@ -37,7 +37,6 @@ _OTHERS = {
     b"PK\x03\x04": "an archive or a workbook (.xlsx): save it as text",
     b"\xd0\xcf\x11\xe0": "a workbook (.xls): save it as text",
     b"\x1f\x8b": "compressed by gzip: unpack it",
-    b"version https://git-lfs": "a pointer of Git LFS in place of the file: `git lfs pull` brings it",
 }
 _MISSING = re.compile(
     r"|-|\?|missing|<na>|null|none|n/?a|#n/?a|#nv|#(?:value|num|ref|div/0)!|-?nan(?:\(s?nan\)|\(ind\))?|"
@@ -50,8 +49,8 @@ _NUMBER = re.compile(
 _THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(?:,\d{3})+")
 _TIME = re.compile(
     r"[\W_]*(?:(?:ros|rosbag|bag|unix|log|host|pc|sys(?:tem)?|device|sensor|elapsed|rel(?:ative)?|epoch|header|recv)"
-    r"[ ._-]*)?(?:time(?:[ ._-]*stamps?)?s?|stamps?|ts?|seconds|date(?:[ _]?time)|millis|micros)(?:\(\))?"
-    r"(?:[ ._-]+(\w+)|[ ._-]*[\[(] ?(\w+) ?[\])])?",
+    r"[ _-]*)?(?:time(?:[ _-]*stamps?)?s?|stamps?|ts?|seconds|n?secs?|nanosec|date(?:[ _]?time)|millis|micros)(?:\(\))?"
+    r"(?:[ _-]+(\w+)|[ _-]*[\[(] ?(\w+) ?[\])])?",
     re.IGNORECASE,
 )
 _UNIT = re.compile(r"(m|u|µ|μ|n|milli|micro|nano)?s(?:ec(?:ond)?s?)?|(millis|micros)(?:\(\))?", re.IGNORECASE)
@@ -71,8 +70,9 @@ def number(cell: str, decimal: str = ".") -> float | None:
 
 
 def is_time(name: str) -> bool:
-    """Whether a column or key is called as times are: time, t, timestamp_ns, `Time [ms]`, `__time`, rosbagTimestamp."""
-    return (match := _TIME.fullmatch(name.strip())) is not None and _unit(match[1] or match[2] or "s") > 0
+    """Whether a column or key is called as times are: t, timestamp_ns, `Time [ms]`, `__time`, `.header.stamp`."""
+    match = _TIME.fullmatch(re.split("[./]", name.strip())[-1])
+    return match is not None and _unit(match[1] or match[2] or "s") > 0
 
 
 def _unit(text: str) -> float:
@@ -83,7 +83,8 @@ def _unit(text: str) -> float:
 
 def in_seconds(times: npt.NDArray[np.float64], name: str, unit: str = "") -> npt.NDArray[np.float64]:
     """Times in seconds, by the unit in their name or beside it, or by their size where they count from 1970."""
-    match = _TIME.fullmatch(name.strip())
+    name = re.split("[./]", name.strip())[-1]
+    match = _TIME.fullmatch(name)
     named = _unit((match and (match[1] or match[2])) or unit) or (_unit(name) if name[:2].lower() == "mi" else 0.0)
     largest = float(np.nanmax(np.abs(times), initial=0.0))
     return times / (named or next((by for size, by in ((1e17, 1e9), (1e14, 1e6), (1e11, 1e3)) if largest > size), 1.0))
@@ -94,7 +95,7 @@ def moment(cell: str, decimal: str = ".") -> float | None:
     if (found := number(cell, decimal)) is not None:
         return found
     try:
-        when = datetime.fromisoformat(cell.strip())
+        when = datetime.fromisoformat(cell.strip().replace("/", "-"))
     except ValueError:
         try:
             day = time_of_day.fromisoformat(cell.strip())
@@ -124,13 +125,15 @@ class Layout:
             raise RecordingError(f"expected decimal='.' or ','; came {decimal!r:.40}", argument="decimal")
         best, most = cls(delimiter or ",", decimal or "."), -1.0
         for point, mark in itertools.product(decimal or ".,", [delimiter] if delimiter else ";\t|, "):
+            if mark == point and not any('"' in line for line in lines):
+                continue
             layout = cls(mark, point)
             rows = [layout.cells(line) for line in lines]
             width = usual(rows)
             own = [row[:64] for row in rows if len(row) == width]
             numbers = sum(number(cell, point) is not None for row in own for cell in row)
             score = (numbers / max(sum(map(len, own)), 1) + 1e-3 * (width > 1)) * len(own)
-            if score > most and mark != point and (width > 1 or point == (decimal or ".")):
+            if score > most and (width > 1 or point == (decimal or ".")):
                 best, most = layout, score
         commas = [cell.strip() for line in lines for cell in best.cells(line)[:64] if "," in cell]
         unsure = [cell for cell in commas if best.decimal == "," and number(cell, ",") is not None]

@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scroll_tactile.errors import FieldError, InputError, RecordingError
+from scroll_tactile import Sensor
+from scroll_tactile.errors import ChannelCountError, FieldError, InputError, RecordingError
 from scroll_tactile.recordings import describe, iterate, read
 from scroll_tactile.recordings.text import number
 
@@ -60,6 +61,8 @@ NAN = float("nan")
         ("# made by hand\n1,2\n# a pause\n3,4\n", [[1, 2], [3, 4]], None),
         ('"a\nx",b\n1,2\n', [[1, 2]], None),
         ("frame,a\n7,1\n8,2\n", [[1], [2]], None),
+        ('"1,5","2,5"\n"3","4,25"\n', [[1.5, 2.5], [3, 4.25]], None),
+        ("time,a\n2026/01/01 00:00:00.5,1\n2026-01-01T00:00:01Z,3\n", [[1], [3]], [1767225600.5, 1767225601]),
         ("__time,a\n0.5,1\n0.6,3\n", [[1], [3]], [0.5, 0.6]),
         ("Time [s],a\n0.5,1\n0.6,3\n", [[1], [3]], [0.5, 0.6]),
         ("timestamp_ns,a\n500000000,1\n600000000,3\n", [[1], [3]], [0.5, 0.6]),
@@ -214,13 +217,16 @@ def test_a_row_of_the_tables_width_is_data_however_it_begins(tmp_path):
     assert read(table(tmp_path, "a,b\n,\n1,2\n")).report.notes == ("1 rows have no number at all",)
 
 
-def test_whole_seconds_are_no_clock(tmp_path):
-    rows = [f"2026-01-01 00:00:{i // 10:02d},{i}" for i in range(300)]
-    path = table(tmp_path, "\n".join(["time,a", *rows, ""]))
-    recording = read(path, rate=10)
-    assert recording.readings.shape == (300, 1) and recording.times[1] == 0.1
-    assert "whole seconds" in recording.report.notes[0]
-    assert read(path, clock="time").times[10] - read(path, clock="time").times[0] == 1
+def test_further_times_and_counters_are_no_taxels(tmp_path):
+    """As rostopic and bagpy write them."""
+    head = "%time,field.header.seq,field.header.stamp,secs,nsecs,field.data0,field.data1"
+    rows = [f"{10**18 + i * 10**7},{7 + i},{10**18 + i * 10**7},1000000000,{i * 10**7},{i}.5,2" for i in range(30)]
+    recording = read(table(tmp_path, "\n".join([head, *rows, ""])))
+    assert recording.field == "field.data0,field.data1" and recording.report.clock == "time"
+    assert recording.report.rate == pytest.approx(100, rel=1e-3)
+    assert "field.header.seq, field.header.stamp, secs, nsecs" in recording.report.notes[0]
+    recording = read(table(tmp_path, "time,a\n01.02.2026 10:00,1\n01.02.2026 10:01,2\n"))
+    assert recording.readings.tolist() == [[1], [2]] and recording.report.clock is None
 
 
 def test_a_file_that_changes_while_it_is_read_is_said_or_refused(tmp_path):
@@ -242,6 +248,19 @@ def test_other_files_are_called_what_they_are(tmp_path, begin):
     (tmp_path / "t.csv").write_bytes(begin + bytes(range(256)))
     with pytest.raises(RecordingError, match="expected text"):
         read(tmp_path / "t.csv")
+
+
+@pytest.mark.parametrize("name", ["", "__time,", "%time,", "Time [s],", "Zeit,"])
+def test_what_an_error_proposes_gives_the_touch_and_no_time(tmp_path, name):
+    path = tmp_path / "t.csv"
+    path.write_text((f"{name}a,b,c,d\n" if name else "") + "".join(f"{i / 100},{i}.5,2,3,1\n" for i in range(150)))
+    sensor = Sensor(name="pad", channels=4, rate=100.0, low=0.0, high=200.0, unit="counts", duration=1.0)
+    recording = read(path)
+    if name in ("", "Zeit,"):
+        with pytest.raises(ChannelCountError, match="columns='1:5'"):
+            recording.stream(sensor)
+        recording = read(path, columns="1:5")
+    assert recording.stream(sensor).readings[:, 0].tolist() == [i + 0.5 for i in range(150)]
 
 
 def test_a_cell_of_many_spaces_is_read(tmp_path):

@@ -130,10 +130,11 @@ class JsonFile(Text):
         self.seen += 1
         try:
             found = self._found(message, self.path_to)
-            with suppress(ValueError, TypeError):
-                values = np.concatenate([np.asarray(each, np.float64).reshape(-1) for each in found])
+            with suppress(ValueError, TypeError, OverflowError):
+                several = [np.asarray(each, np.float64).reshape(-1) for each in found]
+                values = several[0] if len(several) == 1 else np.concatenate(several)
                 self.width = self.width or len(values)
-                if found != [None] and len(values) == self.width > 0:
+                if len(values) == self.width > 0 and found != [None]:
                     return values, self._time(message, times)
             raise FieldError(f"expected {self.width or ''} numbers at {self.path_to!r:.80}; came {found!s:.80}")
         except FieldError as error:
@@ -144,9 +145,10 @@ class JsonFile(Text):
         if self.clock is None and isinstance(message, dict):
             self.clock = next((key for key in message if is_time(key)), "")
         found = self._found(message, self.clock) if self.clock and isinstance(message, dict) else times
-        if found and (time := moment(str(found[0]))) is None:
+        time = found[0] if found else None
+        if found and not isinstance(time, float) and (time := moment(str(found[0]))) is None:
             raise FieldError(f"expected a time at {self.clock!r:.80}; came {found[0]!s:.60}")
-        return time if found else None
+        return time
 
     def _found(self, message: Any, path: str) -> list[Any]:
         """What a path leads to in a message. A key may have letters that no path has; a list may be the reading."""
@@ -162,8 +164,9 @@ class JsonFile(Text):
         """Whether the field leads to something in a list's elements, or is the place of a list of numbers."""
         if not isinstance(rows[0], dict):
             return place == ("" if self.path_to.startswith("[") else self.path_to) and _shape(rows[0]) is not None
-        with suppress(FieldError):
-            return any(self._found(row, self.path_to) for row in rows[:1])
+        for row in rows[:_PARTS]:  # the first may be null
+            with suppress(FieldError):
+                return bool(self._found(row, self.path_to))
         return False
 
     def _values(self) -> Iterator[tuple[int, Any]]:
@@ -216,7 +219,7 @@ def _lists(value: Any, leads: Callable[[str, list[Any]], bool], place: str = "")
         name = next((value[key] for key in _NAMES if isinstance(value.get(key), str)), None)
         for key, inner in value.items():
             for at, rows, own, called in _lists(inner, leads, f"{place}.{key}" if place else key):
-                yield at, rows, own or times, called or name
+                yield at, rows, own or times * (len(times) == len(rows)), called or name
 
 
 def _are_readings(place: str, rows: list[Any]) -> bool:

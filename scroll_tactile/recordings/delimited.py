@@ -258,7 +258,9 @@ class Delimited(Text):
         self.time = None if self.request.clock is None else self._column(self.request.clock)
         apart = []
         for i, name in enumerate(self.columns if self.header else []):
-            if is_time(name):
+            if name.lower() == "date":
+                apart.append(i)
+            elif is_time(name):
                 told = sum(moment(cells[i], self.layout.decimal) is not None for cells in own)
                 if self.time is None and 2 * told >= len(own):
                     self.time = i
@@ -267,9 +269,7 @@ class Delimited(Text):
             elif re.split("[./]", name.lower())[-1] in _COUNTS and _count(cells[i] for cells in own):
                 apart.append(i)
         self.label = None if self.request.labels is None else self._column(self.request.labels)
-        if said := [
-            self.columns[i] for i in apart if self.columns[i] not in ("", "index", "Unnamed: 0") and i != self.time
-        ]:
+        if said := [name for i in apart if (name := self.columns[i]) not in ("", "index", "Unnamed: 0")]:
             self.notes.append(f"left out, as they count or are further times: {', '.join(said)}")
         rest = [i for i in range(self.width) if i not in (self.time, self.label, *apart)]
         self.numbers = [i for i in rest if numeric[i]]

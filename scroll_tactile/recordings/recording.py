@@ -128,7 +128,8 @@ class Recording:
     def cure(self, sensor: Sensor) -> str:
         """What to do where these are not the sensor's readings."""
         wider = self.readings.ndim == 2 and self.readings.shape[1] > sensor.channels
-        low = int(wider and len(self) > 1 and bool((np.diff(self.readings[:, 0]) > 0).all()))  # rises as times do
+        rising = (np.diff(self.readings[:, :2], axis=0) > 0).all(axis=0) if wider and len(self) > 1 else (False, True)
+        low = int(rising[0] and not rising[1])  # as times do, which are no channel
         some = f" Some of its columns are taken by columns='{low}:{low + sensor.channels}'" if wider else ""
         return f"Is it another sensor's recording, or another field?{some}"
 

@@ -563,7 +563,7 @@ def test_what_a_full_memory_refuses_is_not_in_the_journal_either(tmp_path):
         assert learner.materials == dict.fromkeys(NAMES, 2)
         last = learner._ledger.store.last
         sequence = learner.memory.sequence
-        learner._ledger._saved = sequence  # what was faked must not be written
+        learner.memory.saved = sequence  # what was faked must not be written
     assert last == sequence == 8
     with opened(tmp_path / "m") as learner:
         assert learner.digest() == digest

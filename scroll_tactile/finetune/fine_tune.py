@@ -154,7 +154,7 @@ def fine_tune_memory(
         device=device,
         progress=progress,
     )
-    ledger.keep_tuned(tuned, memory, last_sequence, retractions)
+    ledger.keep_tuned(tuned, last_sequence, retractions)
     return report
 
 

@@ -84,9 +84,9 @@ class MemoryStore(Store):
         settings = Settings(exemplars=identity.exemplars, kept_touches=identity.kept_touches)
         return Recipe(identity.sensor, AbsentEmbedding(identity, self.path), settings)
 
-    def heads(self, after: int = 0, *, kind: str | None = None, label: str | None = None) -> Iterator[Head]:
+    def heads(self, after: int = 0, *, kind: str | None = None) -> Iterator[Head]:
         """As `Store.heads`."""
-        return map(self.sound_head, super().heads(after, kind=kind, label=label))
+        return map(self.sound_head, super().heads(after, kind=kind))
 
     def with_key(self, key: bytes) -> Iterator[Head]:
         """As `Store.with_key`."""

@@ -241,7 +241,7 @@ class Memory:
         self.weighings.clear()
         if any(sample.holds(material, key) for sample in self.samples):
             self.stale = True
-        if row.sequence <= self.tuned_last_sequence:
+        if row.sequence <= self.tuned_last_sequence <= self.sequence:  # a reader may have one from behind this
             self.tuned = None
         return Changed(material, annotation.labels)
 

@@ -97,7 +97,7 @@ class Predictor:
         self._version = -1  # of the memory up to which changes are noted
         self._worker: ThreadPoolExecutor | None = None
         self._process = os.getpid()
-        self._composer: tuple[Model, int, int, Composer] | None = None
+        self._composer: tuple[Model, int, Composer] | None = None
         self._estimator: Estimator | None = None
 
     @classmethod
@@ -139,8 +139,9 @@ class Predictor:
         """All that the memory knows at this moment, to be pickled; its touches are compacted there."""
         with self.ledger.lock:
             store, memory = self.ledger.store, self.ledger.memory
-            kept = memory.to_arrays(memory.sequence, exemplar_candidates(memory, store))
-            held = RamStore.compacted_to(self.recipe, sound_rows(store.heads, logger.warning), memory.sequence, kept)
+            arrays, attributes = memory.to_arrays(memory.sequence, exemplar_candidates(memory, store))
+            held = RamStore(self.recipe, sound_rows(store.heads, logger.warning))
+            held.compact(arrays, last_sequence=memory.sequence, attributes=attributes)
             return {"store": held, "recipe": self.recipe, "check": self.extractor.check}
 
     def of_axis(self, axis: str) -> Predictor:
@@ -332,10 +333,9 @@ class Predictor:
         model = self.present()
         if not model.knows_sample:
             model = self._settled()
-        state = model, self.ledger.version, self.ledger.described
-        if self._composer is None or self._composer[:3] != state:
-            self._composer = *state, Composer.of(model, self.ledger.memory)
-        return self._composer[3]
+        if self._composer is None or self._composer[:2] != (model, self.ledger.version):
+            self._composer = model, self.ledger.version, Composer.of(model, self.ledger.memory)
+        return self._composer[2]
 
     def close(self) -> None:
         """As `TactileLearner.close`."""

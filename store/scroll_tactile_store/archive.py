@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import atexit
-import errno
 import os
 import re
 import shutil
@@ -60,15 +59,7 @@ def unpacked(path: Path) -> Iterator[Path]:
             if not is_archive(file.read(ARCHIVE_BYTES)):
                 raise NotAStoreError(f"{path} is a file, and no packed store: {AGAIN}")
             try:
-                packed = zipfile.ZipFile(file)
-            except (*NO_ZIP, OSError) as error:
-                if (
-                    isinstance(error, OSError) and error.errno != errno.EINVAL
-                ):  # a place that is before the file's begin
-                    raise
-                raise NotAStoreError(f"{path} is a file, and no packed store ({error}): {AGAIN}") from error
-            try:
-                _unpack(packed, folder, path, size)
+                _unpack(zipfile.ZipFile(file), folder, path, size)
             except NO_ZIP as error:
                 raise _damage(path, f"does not unpack ({error})") from error
         try:
@@ -82,7 +73,7 @@ def unpacked(path: Path) -> Iterator[Path]:
 
 
 def _damage(path: Path, what: str) -> DamageError:
-    return DamageError(f"{path} {what}: it is damaged or was made to harm. {AGAIN.capitalize()}", path=path)
+    return DamageError(f"{path} {what}: it is damaged or was made to harm; {AGAIN}", path=path)
 
 
 def _unpack(packed: zipfile.ZipFile, folder: Path, path: Path, size: int) -> None:
@@ -90,11 +81,11 @@ def _unpack(packed: zipfile.ZipFile, folder: Path, path: Path, size: int) -> Non
     if sum(entry.file_size for entry in entries) > size:
         raise _damage(path, "lists more bytes than it has")
     for entry in entries:
-        plain = entry.compress_type == zipfile.ZIP_STORED and not entry.flag_bits & 1
-        if not plain or entry.external_attr >> 16 & LINK == LINK:
-            raise _damage(path, f"lists {entry.filename[:100]!r} as a link, or as compressed or encrypted")
-        if not NAMES.fullmatch(entry.filename) or os.path.lexists(folder / entry.filename):
-            raise _damage(path, f"lists {entry.filename[:100]!r}, which is no file of a store, or twice")
+        is_plain = entry.compress_type == zipfile.ZIP_STORED and not entry.flag_bits & 1
+        is_link, is_there = entry.external_attr >> 16 & LINK == LINK, os.path.lexists(folder / entry.filename)
+        if not is_plain or is_link or is_there or not NAMES.fullmatch(entry.filename):
+            what = "which is no file of a store, or twice, a link, compressed or encrypted"
+            raise _damage(path, f"lists {entry.filename[:100]!r}, {what}")
         target = folder / entry.filename
         target.parent.mkdir(parents=True, exist_ok=True)
         with packed.open(entry) as source, target.open("xb") as copy:

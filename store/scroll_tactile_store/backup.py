@@ -8,8 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 from tempfile import mkdtemp
 
-from scroll_tactile_store.exceptions import DamageError, NotAStoreError, StoreError, is_missing, reported
-from scroll_tactile_store.files import copy_regular, is_real_folder, remove_tree, replacing, same_folder
+from scroll_tactile_store.checkpoint_files import CheckpointReader
+from scroll_tactile_store.exceptions import DamageError, NotAStoreError, StoreError, reported
+from scroll_tactile_store.files import copy_regular, remove_tree, replacing, same_folder
 from scroll_tactile_store.layout import (
     CURRENT_FILE,
     PARTIAL,
@@ -46,19 +47,16 @@ def back_up(source: Path, destination: Path, progress: Progress | None) -> None:
 def _copy(source: Path, draft: Path) -> None:
     """Copy what `CURRENT` names, and begin again where a writer replaced some of it meanwhile."""
     for _ in range(ATTEMPTS):
-        current, last, failure = read_current(source / CURRENT_FILE), 0, None
+        current = read_current(source / CURRENT_FILE)
+        # A writer removes what it replaces only after `CURRENT` has ceased to name it.
         try:
             last = _copy_named(source, draft, current)
-        except (OSError, StoreError) as error:
-            if not isinstance(error, DamageError) and not is_missing(error):
+            if read_current(source / CURRENT_FILE) == current:
+                write_current(draft, replace(current, last=max(last, current.last)))
+                return
+        except (DamageError, FileNotFoundError):
+            if read_current(source / CURRENT_FILE) == current:
                 raise
-            failure = error
-        # A writer removes what it replaces only after `CURRENT` has ceased to name it.
-        if read_current(source / CURRENT_FILE) == current:
-            if failure is not None:
-                raise failure
-            write_current(draft, replace(current, last=max(last, current.last)))
-            return
         for entry in draft.iterdir():
             remove_tree(entry)
     raise StoreError(f"{source} changed {ATTEMPTS} times while it was copied: back it up when less is written")
@@ -67,28 +65,23 @@ def _copy(source: Path, draft: Path) -> None:
 def _copy_named(source: Path, draft: Path, current: Current) -> int:
     """Copy what `current` names; return the last row of the log, or 0. Verifying the copy names what is damaged."""
     for named in current.checkpoints:
-        _copy_tree(checkpoint_path(source, named.number), checkpoint_path(draft, named.number))
+        _copy_checkpoint(checkpoint_path(source, named.number), checkpoint_path(draft, named.number))
     # The log last: it has every row that the checkpoints contain.
     with Log(log_path(source, current.log)) as log:
         if current.newest is not None and log.has_place(current.newest.place):
             log.place = current.newest.place
-        rows = Rows(log.place, 0 if current.newest is None else current.newest.last_sequence)
+        rows = Rows(0 if current.newest is None else current.newest.last_sequence)
         rows.catch_up(log)
         with log_path(draft, current.log).open("xb") as copy:
             for offset in range(0, log.place.offset, PART):
-                copy.write(log.bytes_at(offset, min(PART, log.place.offset - offset)))
+                copy.write(log.at(offset, min(PART, log.place.offset - offset)))
         return rows.last
 
 
-def _copy_tree(source: Path, target: Path) -> None:
-    target.mkdir(parents=True)
-    if source.is_symlink():
-        raise DamageError(f"{source} is a symbolic link, where a store has a folder of its own", path=source)
-    for entry in source.iterdir():
-        if is_real_folder(entry):
-            _copy_tree(entry, target / entry.name)
-        else:
-            copy_regular(entry, target / entry.name, LARGEST_FILE)
+def _copy_checkpoint(source: Path, target: Path) -> None:
+    for name in ("zarr.json", *CheckpointReader(source).files):
+        (target / name).parent.mkdir(parents=True, exist_ok=True)
+        copy_regular(source / name, target / name, LARGEST_FILE, within=source.parent.parent)
 
 
 def _verify(source: Path, draft: Path, progress: Progress | None) -> None:

@@ -18,9 +18,7 @@ from __future__ import annotations
 import errno
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 __all__ = [
     "FULL",
@@ -34,7 +32,6 @@ __all__ = [
     "StoreError",
     "StoreFullError",
     "VersionError",
-    "is_missing",
     "reported",
 ]
 
@@ -71,7 +68,7 @@ class DamageError(StoreError):
         self,
         message: str,
         *,
-        path: Path,
+        path: Path = Path(),
         sequence: int | None = None,
         offset: int | None = None,
         frame: int | None = None,
@@ -81,11 +78,6 @@ class DamageError(StoreError):
         self.sequence = sequence
         self.offset = offset
         self.frame = frame
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """A worker's error reaches whoever waits for it."""
-        made_of: dict[str, Any] = {"sequence": self.sequence, "offset": self.offset, "frame": self.frame}
-        return partial(type(self), path=self.path, **made_of), self.args
 
 
 class CompactedError(StoreError):
@@ -106,11 +98,6 @@ class StoreClosedError(StoreError):
 
 class RecordError(StoreError, ValueError):
     """A label, key, time, attribute or array that the store cannot keep as it is."""
-
-
-def is_missing(error: BaseException) -> bool:
-    """Return whether an error is, or was raised for, a file that is not there."""
-    return isinstance(error, FileNotFoundError) or isinstance(error.__cause__, FileNotFoundError)
 
 
 @contextmanager

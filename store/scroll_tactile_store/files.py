@@ -65,19 +65,13 @@ def sync_tree(path: Path) -> None:
         sync_folder(Path(folder))
 
 
-def file_size(path: Path) -> int:
-    """Return the size in bytes, 0 for a file that is not, or no longer, there."""
-    try:
-        return path.lstat().st_size
-    except FileNotFoundError:
-        return 0
-
-
 def tree_size(path: Path) -> int:
     """Return the bytes of a file, or of all files below a folder, 0 when there is none; files may vanish meanwhile."""
-    if path.is_file():
-        return file_size(path)
-    return sum(file_size(Path(folder, name)) for folder, _, files in os.walk(path) for name in files)
+    size, files = 0, [path] if path.is_file() else [Path(at, name) for at, _, names in os.walk(path) for name in names]
+    for file in files:
+        with suppress(FileNotFoundError):
+            size += file.lstat().st_size
+    return size
 
 
 def remove_tree(path: Path) -> None:
@@ -128,23 +122,15 @@ def is_file(path: Path) -> bool:
         return False
 
 
-def is_real_folder(path: Path) -> bool:
-    """Return whether a folder is there, and not a link to one."""
-    try:
-        return stat.S_ISDIR(path.lstat().st_mode)
-    except (FileNotFoundError, NotADirectoryError):
-        return False
-
-
 def read_regular(path: Path, limit: int, *, within: Path | None = None) -> bytes:
     """Return the bytes of a regular file of at most `limit` bytes; raises as `regular_file`."""
     with regular_file(path, limit, within=within) as (file, size):
         return file.read(size)
 
 
-def copy_regular(path: Path, target: Path, limit: int) -> None:
-    """Copy a regular file of at most `limit` bytes, a part at a time. Raises DamageError, OSError."""
-    with regular_file(path, limit) as (file, _), target.open("xb") as copy:
+def copy_regular(path: Path, target: Path, limit: int, *, within: Path | None = None) -> None:
+    """Copy a regular file of at most `limit` bytes, a part at a time; raises as `regular_file`."""
+    with regular_file(path, limit, within=within) as (file, _), target.open("xb") as copy:
         shutil.copyfileobj(file, copy, PART)
 
 
@@ -195,14 +181,12 @@ def dense_size(descriptor: int, path: Path) -> int:
 def store_folder(path: str | os.PathLike[str]) -> Path:
     """Return the absolute path of a folder; raise NotAStoreError for what no file system could call so."""
     try:
-        name = os.fspath(path)
-        if isinstance(name, str) and "\0" not in name and os.fsencode(name) is not None:
-            return Path(name).absolute()
-    except TypeError:
+        folder = Path(path).absolute()
+        if b"\0" not in os.fsencode(folder):
+            return folder
+    except (TypeError, UnicodeEncodeError):
         pass
-    except UnicodeEncodeError as error:
-        raise NotAStoreError(f"{path!r} is no path: it holds half of a surrogate pair") from error
-    raise NotAStoreError(f"expected the path of a folder, without NUL characters; came {path!r}")
+    raise NotAStoreError(f"expected the path of a folder; came {path!r}, which is none")
 
 
 def same_folder(first: Path, second: Path) -> bool:

@@ -4,27 +4,23 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import stat
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
 from scroll_tactile_store.exceptions import DamageError, NotAStoreError, VersionError, reported
-from scroll_tactile_store.files import is_real_folder, new_file, read_regular, remove_tree, replacing
-from scroll_tactile_store.framing import IDENTITY_BYTES, LogPlace
-from scroll_tactile_store.log import Log, refuse
+from scroll_tactile_store.files import new_file, read_regular, remove_tree, replacing
+from scroll_tactile_store.framing import LogPlace
+from scroll_tactile_store.log import Log
 from scroll_tactile_store.records import LARGEST_NUMBER, from_json, json_digest
 
 FORMAT_VERSION = 3
-OLDER = {
-    1: ("0.15 or before", "0.15"),
-    2: ("0.16 to 0.18", "0.18"),
-}  # by which releases, and the last of them
+OLDER = {1: ("0.15 or before", "0.15"), 2: ("0.16 to 0.18", "0.18")}  # by which releases, and the last of them
 CURRENT_FILE = "CURRENT"
 LOG = "log-"
 CHECKPOINTS = "checkpoints"
+CHECKPOINT = f"{CHECKPOINTS}/"  # begins the paths of checkpoints, as LOG those of logs
 PARTIAL, NEW, DAMAGED = ".partial", ".new", ".damaged"
 LOCK_FILE, HOLDER_FILE = "lock", "holder.json"
 LEGACY_FILE = "journal.sqlite"  # of releases 0.x
@@ -32,8 +28,6 @@ OURS = (LOG, CURRENT_FILE, HOLDER_FILE)  # how the names of files begin
 
 LARGEST_CURRENT = 2**16  # bytes, of which it has some hundreds
 MOST_DIGITS = 18  # of a number in a name, so that there is room for those after it
-
-HEX = re.compile(r"[0-9a-f]*")
 
 
 @dataclass(frozen=True)
@@ -49,17 +43,14 @@ class NamedCheckpoint:
     sha256: str
     place: LogPlace
 
-    def to_json(self) -> dict[str, Any]:
-        """Return what is written."""
-        place = [self.place.offset, self.place.number, self.place.previous.hex()]
-        return {"number": self.number, "last_sequence": self.last_sequence, "sha256": self.sha256, "place": place}
-
     @classmethod
-    def from_json(cls, found: Any) -> Self:
-        """Return what `to_json` wrote; raise ValueError, TypeError or KeyError for anything else."""
-        offset, number, previous = found["place"]
-        place = LogPlace(_count(offset), _count(number), _count(number), _hex(previous, 16))
-        return cls(_count(found["number"]), _count(found["last_sequence"]), _hex(found["sha256"], 32).hex(), place)
+    def read(cls, known: Any) -> Self | None:
+        """Return what `CURRENT` says of one, if anything. Raises ValueError, TypeError or KeyError for what is none."""
+        if known is None:
+            return None
+        offset, number, previous = known["place"]
+        place = LogPlace(_count(offset), _count(number), _count(number), bytes.fromhex(previous))
+        return cls(_count(known["number"]), _count(known["last_sequence"]), str(known["sha256"]), place)
 
 
 @dataclass(frozen=True)
@@ -89,13 +80,13 @@ class Current:
 
     def to_bytes(self) -> bytes:
         """Return the bytes of the file."""
-        known: dict[str, Any] = {
-            "format": FORMAT_VERSION,
-            "log": [self.log, self.log_identity.hex()],
-            "newest": None if self.newest is None else self.newest.to_json(),
-            "compaction": None if self.compaction is None else self.compaction.to_json(),
-            "last": self.last,
-        }
+        log = [self.log, self.log_identity.hex()]
+        known: dict[str, Any] = {"format": FORMAT_VERSION, "log": log, "newest": None, "compaction": None}
+        for name, named in (("newest", self.newest), ("compaction", self.compaction)):
+            if named is not None:
+                place = [named.place.offset, named.place.number, named.place.previous.hex()]
+                known[name] = vars(named) | {"place": place}
+        known["last"] = self.last
         return (json.dumps(known | {"sha256": json_digest(known)}) + "\n").encode("ascii")
 
     @classmethod
@@ -105,16 +96,11 @@ class Current:
             known: dict[str, Any] = dict(from_json(data.decode("ascii")))
             if known.pop("sha256", None) != json_digest(known):
                 raise ValueError("its sha256 differs")
-            if (version := _count(known["format"])) != FORMAT_VERSION:
-                raise VersionError(other_format(path, version))
+            if known["format"] != FORMAT_VERSION:
+                raise VersionError(other_format(path, known["format"]))
             number, identity = known["log"]
-            newest, compaction = (
-                None if known[name] is None else NamedCheckpoint.from_json(known[name])
-                for name in ("newest", "compaction")
-            )
-            if compaction is not None and (newest is None or newest.last_sequence < compaction.last_sequence):
-                raise ValueError("its compaction checkpoint is newer than its newest checkpoint")
-            return cls(_count(number), _hex(identity, IDENTITY_BYTES), newest, compaction, _count(known.get("last", 0)))
+            named = [NamedCheckpoint.read(known[name]) for name in ("newest", "compaction")]
+            return cls(_count(number), bytes.fromhex(identity), *named, last=_count(known.get("last", 0)))
         except (KeyError, TypeError, ValueError) as error:
             raise _not_as_written(path, error) from error
 
@@ -146,12 +132,6 @@ def _count(value: Any) -> int:
     if type(value) is not int or not 0 <= value <= LARGEST_NUMBER:
         raise ValueError(f"{str(value)[:80]!r} is no number")
     return value
-
-
-def _hex(text: Any, size: int) -> bytes:
-    if not isinstance(text, str) or len(text) != 2 * size or not HEX.fullmatch(text):
-        raise ValueError(f"{str(text)[:80]!r} is not {size} bytes in hexadecimal")
-    return bytes.fromhex(text)
 
 
 def read_current(path: Path) -> Current:
@@ -188,22 +168,18 @@ def is_number(stem: str) -> bool:
     return stem.isascii() and stem.isdigit() and len(stem) <= MOST_DIGITS
 
 
-def log_numbers(folder: Path, *, unfinished: bool = False) -> list[int]:
-    """Return the numbers of the logs in a store's folder, ascending; unfinished: of half written ones, too."""
-    names = (entry.name for entry in folder.iterdir() if entry.name.startswith(LOG))
-    return _numbers((name.removeprefix(LOG) for name in names), NEW if unfinished else "")
+def numbers(folder: Path, begin: str, end: str = "") -> list[int]:
+    """Return the numbers of the logs (begin: LOG) or checkpoints (CHECKPOINT) in a store's folder, ascending.
+
+    end: of drafts of them, which count, too.
+    """
+    return sorted(set(_numbered(folder, begin, end).values()))
 
 
-def numbers(folder: Path, *, unfinished: bool = False) -> list[int]:
-    """Return the numbers of the checkpoints in a store's folder, as `log_numbers` those of logs."""
-    parent = folder / CHECKPOINTS
-    entries = parent.iterdir() if is_real_folder(parent) else ()
-    return _numbers((entry.name for entry in entries), PARTIAL if unfinished else "")
-
-
-def _numbers(names: Iterable[str], suffix: str) -> list[int]:
-    stems = {name.removesuffix(suffix) for name in names}
-    return sorted({int(stem) for stem in stems if is_number(stem)})
+def _numbered(folder: Path, begin: str, end: str) -> dict[Path, int]:
+    names = {path: path.relative_to(folder).as_posix() for path in folder.glob(f"{begin}*")}
+    stems = {path: name.removeprefix(begin).removesuffix(end) for path, name in names.items()}
+    return {path: int(stem) for path, stem in stems.items() if is_number(stem)}
 
 
 def holds_store(folder: Path) -> bool:
@@ -216,7 +192,7 @@ def holds_store(folder: Path) -> bool:
         if not folder.exists():
             return False
         if not folder.is_dir():
-            raise NotAStoreError(f"{folder} is a file; a store is a folder")
+            raise NotAStoreError(f'{folder} is a file: a packed store is opened with mode="read", or merged')
         require_safe(folder)
         try:
             read_current(folder / CURRENT_FILE)
@@ -229,23 +205,22 @@ def holds_store(folder: Path) -> bool:
                 "recordings, or keep that release to read it"
             )
         # The first log is made before `CURRENT`: a writer may have died in between.
-        logs = [log_path(folder, number).name for number in log_numbers(folder)]
-        traces = [name for name in logs if name != log_path(folder, 1).name or _has_batches(folder / name)]
-        traces += [CHECKPOINTS] if numbers(folder) else []
-        traces += [name for name in names if DAMAGED in name]
+        logs, first = [log_path(folder, number) for number in numbers(folder, LOG)], log_path(folder, 1)
+        traces = [log.name for log in logs if log != first or _has_batches(log)]
+        traces += [name for name in names if DAMAGED in name] + [CHECKPOINTS] * any(numbers(folder, CHECKPOINT))
         foreign = [name for name in names if not name.startswith(OURS) and name not in (LOCK_FILE, CHECKPOINTS)]
         if os.path.lexists(folder / CURRENT_FILE):
             return True  # another process made it meanwhile
         if traces:
             raise DamageError(
-                f"{folder} has {' and '.join(sorted(traces))} but no {CURRENT_FILE}: put it back from a copy, or "
-                "repair the store (repair_store), which finds what it named",
+                f"{folder} has {' and '.join(traces)} but no {CURRENT_FILE}: put it back from a copy, or repair the "
+                "store (repair_store), which finds what it named",
                 path=folder / CURRENT_FILE,
             )
         if foreign:
             raise NotAStoreError(
-                f"{folder} holds no store but other things ({', '.join(foreign[:3])}"
-                f"{', …' if len(foreign) > 3 else ''}): nothing was written; choose an empty or a new folder"
+                f"{folder} holds no store but other things ({', '.join(foreign[:3])}…): nothing was written; choose an "
+                "empty or a new folder"
             )
         return False
 
@@ -254,58 +229,50 @@ def _has_batches(path: Path) -> bool:
     """Whether more than its first frame was ever written to a log."""
     try:
         with Log(path) as log:
-            return any(True for _ in log.scan(refuse))
+            return log.size() > log.place.offset
     except DamageError:
         return True
 
 
 def require_safe(folder: Path, *, written: bool = False) -> None:
-    """Raise DamageError for the first of `unsafe_entries`."""
-    with reported(folder, "looking at what is there"):
-        for error in unsafe_entries(folder, written=written) if folder.is_dir() else ():
-            raise error
-
-
-def unsafe_entries(folder: Path, *, written: bool = False) -> Iterator[DamageError]:
-    """Yield an error for each thing in a store's folder that is there under a name of ours, and is not of its kind.
+    """Raise DamageError for what is in a store's folder under a name of ours, and is not of its kind.
 
     A link would lead what is read, written or removed out of the folder; to read from a pipe or a device may never
-    end. written: also for a file that is written in place and has another name, which that would change, too. Raises
-    OSError.
+    end. written: also for a file that is written in place and has another name, which that would change, too.
     """
-    for parent in (folder, folder / CHECKPOINTS):
-        for path in parent.iterdir() if is_real_folder(parent.resolve() if parent == folder else parent) else ():
-            is_folder = path.name == CHECKPOINTS if parent == folder else is_number(path.name.removesuffix(PARTIAL))
-            is_file = parent == folder and (path.name.startswith(OURS) or path.name == LOCK_FILE)
+    with reported(folder, "looking at what is there"):
+        for path in (*folder.glob("*"), *folder.glob(f"{CHECKPOINT}*")):
+            if path.parent == folder:
+                is_folder, is_file = path.name == CHECKPOINTS, path.name.startswith(OURS) or path.name == LOCK_FILE
+            else:
+                is_folder, is_file = is_number(path.name.removesuffix(PARTIAL)), False
             try:
                 status = path.lstat()
             except FileNotFoundError:  # another process may have written it and moved it
                 continue
             if (is_folder and not stat.S_ISDIR(status.st_mode)) or (is_file and not stat.S_ISREG(status.st_mode)):
                 what = "a symbolic link" if stat.S_ISLNK(status.st_mode) else "no regular file or folder"
-                yield DamageError(
+                raise DamageError(
                     f"{path} is {what}, where a store has a file or folder of its own: nothing was read through it. "
                     "Put what belongs there in its place; in a folder that comes from elsewhere trust nothing",
                     path=path,
                 )
-            elif written and is_file and status.st_nlink > 1:
-                yield DamageError(
+            if written and is_file and status.st_nlink > 1:
+                raise DamageError(
                     f"{path} has another name somewhere (a hard link), and what is written here would change it there: "
                     'copy the folder (cp -r) and open the copy, or open this one with mode="read"',
                     path=path,
                 )
 
 
-def remove_unnamed(folder: Path, current: Current) -> None:
-    """Remove logs and checkpoints, finished or not, that `current` does not name; what cannot be removed stays.
-
-    What does not carry a name of ours is left alone.
-    """
+def unnamed(folder: Path, current: Current) -> list[Path]:
+    """Return the logs, checkpoints and drafts of these, which `current` does not name."""
     kept = {log_path(folder, current.log), *(checkpoint_path(folder, named.number) for named in current.checkpoints)}
-    found = [(log_path(folder, number), NEW) for number in log_numbers(folder, unfinished=True)]
-    found += [(checkpoint_path(folder, number), PARTIAL) for number in numbers(folder, unfinished=True)]
-    remove_tree(folder / (CURRENT_FILE + NEW))
-    for path, suffix in found:
-        if path not in kept:
-            remove_tree(path)
-        remove_tree(path.with_name(path.name + suffix))
+    found = {*_numbered(folder, LOG, NEW), *_numbered(folder, CHECKPOINT, PARTIAL)} - kept
+    return [*found, *folder.glob(CURRENT_FILE + NEW)]
+
+
+def remove_unnamed(folder: Path, current: Current) -> None:
+    """Remove what is `unnamed`; what cannot be removed stays, and what does not carry a name of ours."""
+    for path in unnamed(folder, current):
+        remove_tree(path)

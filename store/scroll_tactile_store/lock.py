@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import os
 import socket
@@ -29,8 +28,6 @@ if TYPE_CHECKING:
 
 LARGEST_NOTE = 4096  # bytes
 
-WITHOUT_LOCKS = frozenset({errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP})
-
 
 class WriterLock:
     """The writer's lock on a store's folder, held from construction until `release`.
@@ -47,18 +44,13 @@ class WriterLock:
         # Not per thread: the thread that closes the store need not be the one that opened it.
         # Nor the lock of a file's mere presence, which filelock takes where there is no other: it outlives its holder.
         self._lock: BaseFileLock = FileLock(folder / LOCK_FILE, thread_local=False, fallback_to_soft=False)
-        with reported(folder, "taking the writer's lock"):
+        with reported(folder, "taking the writer's lock, without which two writers could spoil it"):
             try:
                 self._lock.acquire(blocking=False)
             except Timeout:
                 raise LockedError(self._refusal()) from None
-            except (NotImplementedError, OSError) as error:
-                if isinstance(error, OSError) and error.errno not in WITHOUT_LOCKS:
-                    raise
-                raise StoreError(
-                    f"the file system of {folder} has no locks ({error}), without which two writers could spoil a "
-                    'store: keep it on another one and copy it here, or open it with mode="read"'
-                ) from error
+            except NotImplementedError as error:
+                raise StoreError(f"{folder} lies where there are no locks: keep it on another file system") from error
         try:
             with reported(folder, "noting who holds the lock"):
                 self._note_holder()
@@ -77,13 +69,13 @@ class WriterLock:
     def _refusal(self) -> str:
         try:
             holder = json.loads(read_regular(self._folder / HOLDER_FILE, LARGEST_NOTE))
-            pid, host, since = int(holder["pid"]), str(holder["host"]), str(holder["since"])
-            who = f"process {pid} on {host if host.isprintable() else ascii(host)} since {ascii(since)[1:-1]}"
+            who = f"process {holder['pid']} on {holder['host']} since {holder['since']}"
         except (OSError, ValueError, TypeError, KeyError, RecursionError, DamageError):
             # The holder writes the note just after it takes the lock and removes it just before it releases it.
             who = "a process that left no note of itself"
+        shown = who if who.isprintable() else ascii(who)
         return (
-            f"{self._folder} is being written by {who}: close the store there (the lock frees itself when "
+            f"{self._folder} is being written by {shown}: close the store there (the lock frees itself when "
             'that process ends), or open it here with mode="read"'
         )
 

@@ -12,17 +12,15 @@ import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from shutil import disk_usage
 from typing import Self
 
-from scroll_tactile_store.exceptions import FULL, DamageError, RecordError, StoreClosedError, VersionError, reported
+from scroll_tactile_store.exceptions import FULL, DamageError, StoreClosedError, VersionError, reported
 from scroll_tactile_store.files import dense_size, new_file, open_regular, replacing, sync_open
 from scroll_tactile_store.framing import (
     COMMIT,
     FRAME_BYTES,
     HEADER,
     IDENTITY_BYTES,
-    LARGEST_PAYLOAD,
     MARK,
     NO_CHECKSUM,
     VERSION,
@@ -46,10 +44,8 @@ PART = 2**18  # bytes of the file that are looked through at once
 ATTEMPTS = 3
 
 # Zeros are written ahead: to write over them changes nothing but bytes, and fdatasync has no file system's journal to
-# wait for. (Room that was only reserved costs as many bytes on the disk, and thrice the time.) Of a disk that is nearly
-# full the rest is for others.
+# wait for. (Room that was only reserved costs as many bytes on the disk, and thrice the time.)
 AHEAD = 2**20
-SPARE_ROOM = 16 * AHEAD
 LARGEST_STAGED = 2**22  # bytes that wait in memory for their commit
 TOGETHER = 4096  # frames of a batch in a log that replaces another
 NO_ROOM = FULL | {errno.EFBIG}
@@ -68,8 +64,8 @@ class Log:
     reading, or the one writer, goes on: behind the first frame, until something is scanned. One thread at a time may
     use it.
 
-    write: for whoever holds the writer's lock. identity: of a log whose first frame may be damaged, b"" where nobody
-    knows it; then `header_damage` names that damage, and a scan begins with the first frame that can be found.
+    write: for whoever holds the writer's lock. identity: of a log whose first frame may be damaged; then
+    `header_damage` names that damage, and a scan begins with the first frame that can be found.
 
     Raises VersionError for a newer format, DamageError for what is no log, StoreError, and OSError when it is opened.
     """
@@ -78,6 +74,7 @@ class Log:
         self.path, self.header = path, b""
         self.header_damage: DamageError | None = None
         self._proved: Frame | None = None
+        self._staged, self._written = bytearray(), 0
         self._descriptor = open_regular(path, os.O_RDWR if write else os.O_RDONLY)
         try:
             self._read_header(identity)
@@ -97,15 +94,11 @@ class Log:
             if identity is None:
                 raise
             self.header_damage = damage
-            found = identity or next((frame.identity for frame in self._frames_behind(0, MARK)), None)
-            if found is None:
-                raise
-            self.identity, self._mark = found, MARK + found
+            self.identity, self._mark = identity, MARK + identity
         self.first = self.place
 
     def _first_frame(self) -> Frame:
-        self.size()
-        frame = read_frame(self._at(0, FRAME_BYTES), 0)
+        frame = read_frame(self.at(0, FRAME_BYTES), 0)
         if frame is None:
             raise self._damage("does not begin as a log, or its first frame is not as it was written", BEGIN)
         if frame.version > VERSION:
@@ -122,8 +115,13 @@ class Log:
 
     # Reading.
 
-    def _at(self, offset: int, size: int) -> bytes:
-        """Return so many bytes of the file at an offset, fewer where it ends."""
+    def at(self, offset: int, size: int) -> bytes:
+        """Return so many bytes of the log at an offset, staged ones, too; fewer where it ends."""
+        begin = offset - self._written
+        if 0 <= begin < len(self._staged):
+            return bytes(self._staged[begin : begin + size])
+        if (size := min(size, self.size() - offset)) <= 0 or offset < 0:
+            return b""
         os.lseek(self._open(), offset, os.SEEK_SET)
         data = part = os.read(self._descriptor, size)
         while part and len(data) < size:
@@ -146,8 +144,8 @@ class Log:
     def scan(self, damaged: Damaged, durable: LogPlace | None = None) -> Iterator[list[Frame]]:
         """Yield the frames of each batch that was committed behind `place`, verified and in order; move that behind it.
 
-        A batch without its commit frame is not there yet. durable: a place that was noted elsewhere; where it is in the
-        log what is before it is no torn batch.
+        A batch without its commit frame is not there yet. durable: a place that was noted elsewhere; what is before it
+        is no torn batch.
         """
         if self.place == BEGIN:
             self._resume(BEGIN)
@@ -169,21 +167,20 @@ class Log:
 
     def _next_batch(self, durable: LogPlace | None) -> tuple[list[Frame], LogPlace | None, str | None]:
         """Return the next batch; or what verifies of it, the place where it ends, and what proves that it was whole."""
-        with reported(self.path, "reading the log"):
-            for attempt in range(ATTEMPTS):
-                frames, torn = self._batch()
-                if torn is None:
-                    return frames, None, None
-                proof = self._proof(torn, durable) if attempt else None
-                if attempt and proof is None:
-                    break
+        for attempt in range(ATTEMPTS):
+            frames, torn = self._batch()
+            if torn is None:
+                return frames, None, None
+            proof = self._proof(torn, durable) if attempt else None
+            if attempt and proof is None:
+                break
         return frames, torn, proof
 
     def _batch(self) -> tuple[list[Frame], LogPlace | None]:
         """Return the frames from the place on that verify, up to a commit frame, or the place where one does not."""
         place, size, frames = self.place, self.size(), list[Frame]()
         while True:
-            data = self._at(place.offset, USUAL)
+            data = self.at(place.offset, USUAL)
             frame = read_frame(data, place.offset)
             if frame is None or not self._is_ours(frame) or not place.holds(frame) or frame.end > size:
                 return frames, place
@@ -199,8 +196,8 @@ class Log:
     def _payload(self, frame: Frame, begin: bytes) -> bytes:
         """Return the payload of a frame, verified; begin: what was read of it, and maybe of what is behind it."""
         payload = begin[: frame.size]
-        if len(payload) < frame.size <= min(LARGEST_PAYLOAD, self.size()):
-            payload += self._at(frame.payload_offset + len(payload), frame.size - len(payload))
+        if len(payload) < frame.size:
+            payload += self.at(frame.payload_offset + len(payload), frame.size - len(payload))
         if len(payload) != frame.size or payload_digest(payload) != frame.digest:
             raise self._damage(f"is damaged: the payload of frame {frame.number} is not as it was written", frame)
         return payload
@@ -208,32 +205,29 @@ class Log:
     def _proof(self, torn: LogPlace, durable: LogPlace | None) -> str | None:
         """Return what no power cut can have left behind a torn frame, in words; None where there is nothing."""
         if durable is not None and torn.offset < durable.offset:
-            commit = pack_frame(self.identity, torn, COMMIT, b"")[1]  # as it was, where only that is damaged
-            if LogPlace.behind(commit) == durable or self.has_place(durable):
-                return "the place of the newest checkpoint"
+            return "the place of the newest checkpoint"
         known = self._proved  # or each of many damaged frames would be a search of all that is behind it
         if known is None or known.offset <= torn.offset or torn.can_be_torn_before(known):
-            behind = self._frames_behind(torn.offset, self._mark)
+            behind = self._frames_behind(torn.offset)
             self._proved = known = next((frame for frame in behind if not torn.can_be_torn_before(frame)), None)
         return None if known is None else f"frame {known.number} at byte {known.offset}"
 
     def _resume(self, torn: LogPlace) -> bool:
         """Go on behind a damaged frame, at the next that can be found, if any."""
-        with reported(self.path, "looking for a frame behind damage"):
-            found = next(filter(torn.is_before, self._frames_behind(torn.offset, self._mark)), None)
+        found = next(filter(torn.is_before, self._frames_behind(torn.offset)), None)
         if found is not None:
             self.place = LogPlace(found.offset, found.number, found.batch, found.previous)
         return found is not None
 
-    def _frames_behind(self, offset: int, mark: bytes) -> Iterator[Frame]:
+    def _frames_behind(self, offset: int) -> Iterator[Frame]:
         """Yield the frames whose first bytes verify, found by what they begin with, wherever they are."""
         for start in range(offset, self.size(), PART):
-            data = self._at(start, PART + FRAME_BYTES - 1)
-            found = data.find(mark)
+            data = self.at(start, PART + FRAME_BYTES - 1)
+            found = data.find(self._mark)
             while 0 <= found < PART:
                 if (frame := read_frame(data[found : found + FRAME_BYTES], start + found)) is not None:
                     yield frame
-                found = data.find(mark, found + 1)
+                found = data.find(self._mark, found + 1)
 
     def has_place(self, place: LogPlace) -> bool:
         """Return whether a place is behind the first frame or a batch of this log."""
@@ -249,46 +243,28 @@ class Log:
         first: so many of its first bytes, or all; only that the frame is there is verified.
         """
         wanted = size if first is None else min(first, size)
-        with reported(self.path, "reading a frame"):
-            data = self._raw(offset, FRAME_BYTES + wanted)
-            frame = read_frame(data, offset)
-            if frame is None or not self._is_ours(frame) or frame.size != size or len(data) < FRAME_BYTES + wanted:
-                raise self._damage(
-                    f"holds no frame with a payload of {size} bytes there", BEGIN._replace(offset=offset)
-                )
-            return self._payload(frame, data[FRAME_BYTES:]) if first is None else data[FRAME_BYTES:]
-
-    def _raw(self, offset: int, size: int) -> bytes:
-        """Return bytes of the log, staged ones, too, fewer where it ends."""
-        begin = offset - self._written
-        if 0 <= begin < len(self._staged):
-            return bytes(self._staged[begin : begin + size])
-        room = self.size() - offset
-        return self._at(offset, min(size, room)) if offset >= 0 and room > 0 else b""
+        data = self.at(offset, FRAME_BYTES + wanted)
+        frame = read_frame(data, offset)
+        if frame is None or not self._is_ours(frame) or frame.size != size or len(data) < FRAME_BYTES + wanted:
+            raise self._damage(f"holds no frame with a payload of {size} bytes there", BEGIN._replace(offset=offset))
+        return self._payload(frame, data[FRAME_BYTES:]) if first is None else data[FRAME_BYTES:]
 
     def frame_at(self, offset: int) -> Frame | None:
         """Return the frame at an offset, whose payload is not looked at; None where there is none of this log."""
-        with reported(self.path, "reading a frame"):
-            frame = read_frame(self._at(offset, FRAME_BYTES), offset)
-            return frame if frame is not None and self._is_ours(frame) else None
-
-    def bytes_at(self, offset: int, size: int) -> bytes:
-        """Return bytes of the file as they are, fewer where it ends."""
-        with reported(self.path, "copying the log"):
-            return self._at(offset, size)
+        frame = read_frame(self.at(offset, FRAME_BYTES), offset)
+        return frame if frame is not None and self._is_ours(frame) else None
 
     # Writing, by whoever holds the writer's lock.
 
     def prepare(self) -> None:
         """Make ready to append at `place`, behind all that was committed; cut off what a kill or a power cut left."""
-        with reported(self.path, "preparing the log"):
-            self._begin_batch()
-            self._allocated = self.size()
-            parts = (self._at(at, PART) for at in range(self.place.offset, self._allocated, PART))
-            self._settled = not any(part.count(0) < len(part) for part in parts)
-            self._settle()
-            # The last commit may be in the system's memory alone, if its writer was killed before its sync.
-            sync_open(self._descriptor)
+        self._begin_batch()
+        self._allocated = self.size()
+        parts = (self.at(at, PART) for at in range(self.place.offset, self._allocated, PART))
+        self._settled = not any(part.count(0) < len(part) for part in parts)
+        self._settle()
+        # The last commit may be in the system's memory alone, if its writer was killed before its sync.
+        sync_open(self._descriptor)
 
     def _begin_batch(self) -> None:
         """Nothing is staged, and what is written next belongs behind the last commit."""
@@ -307,21 +283,14 @@ class Log:
     def stage(self, kind: int, payload: bytes) -> Frame:
         """Add a frame to the batch that the next `commit` makes durable; `kind` is 2 or more, the caller's.
 
-        After an error the whole batch is not there.
+        Raises OSError; then, and when `commit` fails, `rollback` is the caller's to call.
         """
-        if not COMMIT < kind < 2**32 or len(payload) > LARGEST_PAYLOAD:
-            raise RecordError(f"a frame of kind {kind} and {len(payload)} bytes cannot be kept")
-        with reported(self.path, "appending to the log"):
-            if self._next == self.place:
-                self._settle()  # a batch that could not be taken back
-            try:
-                frame = self._pack(kind, payload)
-                if len(self._staged) > LARGEST_STAGED:
-                    self._write()
-            except BaseException:
-                self.rollback()
-                raise
-            return frame
+        if self._next == self.place:
+            self._settle()  # a batch that could not be taken back
+        frame = self._pack(kind, payload)
+        if len(self._staged) > LARGEST_STAGED:
+            self._write()
+        return frame
 
     def _pack(self, kind: int, payload: bytes) -> Frame:
         data, frame = pack_frame(self.identity, self._next, kind, payload)
@@ -333,19 +302,15 @@ class Log:
         """Write what is staged, with one call, and zeros behind it where the file ends."""
         begin, end = self._written, self._written + len(self._staged)
         self._settled = False  # until it is committed
-        ahead = end
-        # Asked of the open file, whose folder may have been moved; Windows takes a path alone.
-        where = self.path.parent if os.name == "nt" else self._open()
-        if end > self._allocated and disk_usage(where).free > SPARE_ROOM:
-            ahead = -(-end // AHEAD) * AHEAD
+        zeros = bytes(-end % AHEAD) if end > self._allocated else b""
         try:
-            self._put(begin, self._staged + bytes(ahead - end) if ahead > end else self._staged)
+            self._put(begin, self._staged + zeros if zeros else self._staged)
         except OSError as error:
-            if ahead == end or error.errno not in NO_ROOM:
+            if not zeros or error.errno not in NO_ROOM:
                 raise
+            zeros = b""
             self._put(begin, self._staged)
-            ahead = end
-        self._allocated = max(self._allocated, ahead)
+        self._allocated = max(self._allocated, end + len(zeros))
         self._written, self._staged = end, bytearray()
 
     def _put(self, offset: int, data: bytearray) -> None:
@@ -359,20 +324,14 @@ class Log:
         """Make the staged frames durable, all of them or none; without any it does nothing.
 
         seal: also where there are none. Such a batch proves damage of the one before it; what befalls the last batch
-        cannot be told from what a power cut leaves. Raises StoreFullError or another StoreError, and then the log is
-        as it was at the last commit.
+        cannot be told from what a power cut leaves. Raises OSError.
         """
         if self._next == self.place and not seal:
             return
-        with reported(self.path, "making a batch durable"):
-            try:
-                self._pack(COMMIT, b"")
-                self._write()
-                sync_open(self._descriptor, data_only=True)
-            except BaseException:
-                self.rollback()
-                raise
-            self.place, self._settled = self._next, True
+        self._pack(COMMIT, b"")
+        self._write()
+        sync_open(self._descriptor, data_only=True)
+        self.place, self._settled = self._next, True
 
     def rollback(self) -> None:
         """Forget the staged frames.
@@ -412,8 +371,6 @@ def create_log(path: Path, header: bytes, frames: Iterable[tuple[int, bytes]] = 
     header: of the caller, for good. A log that is there is replaced; readers keep it open as it was. Raises
     StoreFullError, ReadOnlyError or another StoreError.
     """
-    if len(header) > LARGEST_PAYLOAD:
-        raise RecordError(f"a log's first frame of {len(header)} bytes cannot be kept")
     draft = path.with_name(f"{path.name}.new")
     identity = os.urandom(IDENTITY_BYTES)
     with reported(path, "making a log"), replacing(path, draft):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -15,10 +14,10 @@ from scroll_tactile_store.files import store_folder, sync_folder
 from scroll_tactile_store.layout import (
     DAMAGED,
     LOG,
+    NEW,
     Current,
-    is_number,
-    log_numbers,
     log_path,
+    numbers,
     remove_unnamed,
     require_safe,
     write_current,
@@ -26,8 +25,8 @@ from scroll_tactile_store.layout import (
 from scroll_tactile_store.lock import WriterLock
 from scroll_tactile_store.log import Log, create_log
 from scroll_tactile_store.records import to_json
-from scroll_tactile_store.rows import ROW, head_without_arrays, read_back
-from scroll_tactile_store.survey import HEADLESS, FoundCheckpoint, Progress, Survey, require_store
+from scroll_tactile_store.rows import ROW, head_without_arrays, read_back, read_head
+from scroll_tactile_store.survey import Progress, Survey, require_store
 
 
 @dataclass(frozen=True)
@@ -71,136 +70,74 @@ def repair_store(path: str | PathLike[str], *, progress: Progress | None = None)
             try:
                 return _repair(survey) if survey.problems() else Repair(survey.last, [], None)
             finally:
-                survey.log.close()
+                survey.close()
     finally:
         lock.release()
 
 
-@dataclass(frozen=True)
-class _Plan:
-    """Rows 1 to `kept` stay, those up to `compacted` without arrays.
-
-    `start` is the checkpoint to begin with, `stand_in` the one that stands for the rows up to `compacted`; `fresh`
-    tells whether that is another than before.
-    """
-
-    kept: int
-    compacted: int
-    fresh: bool
-    start: FoundCheckpoint | None
-    stand_in: FoundCheckpoint | None
-
-    @classmethod
-    def of(cls, survey: Survey) -> _Plan:
-        start = survey.sound[0] if survey.sound else None
-        newest = 0 if start is None else start.last_sequence
-        is_known = not survey.compacted or survey.compaction is not None
-        standing = survey.compacted if is_known else 0
-        # Up to `compacted` no row has arrays; without the checkpoint that stood for them they are as good as damaged.
-        fresh = bool(survey.faulty(standing + 1, newest)) or (standing < survey.compacted and newest > 0)
-        behind = survey.faulty(newest + 1, survey.last)
-        kept = behind[0][0] - 1 if behind else survey.last
-        if survey.compacted > newest:
-            kept = newest
-        return cls(kept, newest if fresh else standing, fresh, start, start if fresh else survey.compaction)
-
-
-def _lost(survey: Survey, plan: _Plan) -> Iterator[str]:
-    """Say what a repair gives up."""
-    newest = 0 if plan.start is None else plan.start.last_sequence
-    which = "" if plan.start is None else f"checkpoint {int(plan.start.folder.name)}"
-    for _, what in survey.faulty(1, newest):
-        yield f"{what}; what they did is in {which}, but can no longer be retracted"
-    if plan.fresh:
-        what = f"rows 1 to {plan.compacted} give up their arrays, {which} stands for them"
-        yield f"{what}: none of them can be retracted any more{_counts_again(survey, plan)}"
-    if plan.kept < survey.last:
-        behind = survey.faulty(newest + 1, survey.last)
-        why = behind[0][1] if behind else "the compaction checkpoint that they continue is lost"
-        what = f"rows {plan.kept + 1} to {survey.last} are dropped, also those that verify: {why}"
-        yield f"{what}, and nobody knows what that did to the others"
-    if survey.log.damage and not survey.log.rows:
-        yield f"{'; '.join(survey.log.damage)}: the rows behind {newest}, if there were any, are lost"
-    for found in survey.checkpoints:
-        if found.damage and (survey.current is not None or found.named is not None):
-            yield f"checkpoint {int(found.folder.name)}: {'; '.join(map(str, found.damage))}"
-
-
-def _counts_again(survey: Survey, plan: _Plan) -> str:
-    """Return in words which rows behind a new compaction checkpoint can have taken back one that it contains."""
-    behind = [sequence for sequence in survey.log.rows if plan.compacted < sequence <= plan.kept]
-    if not behind:
-        return ""
-    kinds = Counter(survey.log.head(sequence).kind for sequence in behind)
-    which = f"row {behind[0]}" if len(behind) == 1 else f"rows {behind[0]} to {behind[-1]}"
-    named = ", ".join(f"{count} {kind}" for kind, count in kinds.items())
-    return f"; what {which} ({named}) took back of them counts again"
-
-
 def _repair(survey: Survey) -> Repair:
+    folder, last = survey.folder, survey.last
     if survey.identity is None:
         raise DamageError(
-            f"neither {survey.log.path} nor a checkpoint beside it tells what the store in {survey.folder} is for: put "
-            "the folder back from a copy",
-            path=survey.log.path,
+            f"neither {survey.path} nor a checkpoint beside it tells what the store in {folder} is for: put the "
+            "folder back from a copy",
+            path=survey.path,
         )
-    folder, plan = survey.folder, _Plan.of(survey)
-    lost = list(_lost(survey, plan))
-    number = 1 + max(_taken(survey), default=0)
+    start = survey.sound[0] if survey.sound else None
+    newest = 0 if start is None else start.last_sequence
+    stand_in = next((each for each in survey.sound if each.last_sequence == survey.compacted > 0), None)
+    # Up to `compacted` no row has arrays; without the checkpoint that stood for them they are as good as damaged.
+    is_orphan = stand_in is None and survey.compacted > 0
+    behind = survey.faulty(newest + 1, last)
+    kept = behind[0][0] - 1 if behind else last
+    if survey.compacted > newest:
+        kept, behind = newest, [(newest + 1, "the compaction checkpoint that they continue is lost")]
+    lost = [
+        f"{what}; what they did is in checkpoint {start.number}, but can no longer be retracted"
+        for _, what in survey.faulty(1, newest)
+        if start is not None
+    ]
+    if start is not None and (is_orphan or survey.faulty(survey.compacted + 1, newest)):
+        stand_in, back = start, f"; what rows behind {newest} took back of them counts again"
+        what = f"rows 1 to {newest} give up their arrays, checkpoint {start.number} stands for them: none of them can"
+        lost.append(f"{what} be retracted any more{back if kept > newest else ''}")
+    if kept < last:
+        what = f"rows {kept + 1} to {last} are dropped, also those that verify: {behind[0][1]}"
+        lost.append(f"{what}, and nobody knows what that did to the others")
+    if not survey.rows and any(problem.path == survey.path for problem in survey.problems()):
+        lost.append(f"nothing of {survey.path} can be read: the rows behind {newest}, if there were any, are lost")
+    lost += [f"checkpoint {int(path.name)}: {damage}" for path, damage in survey.spoilt.items()]
+
+    number = 1 + max(numbers(folder, LOG, NEW), default=0)
+    compacted = 0 if stand_in is None else stand_in.last_sequence
     path = log_path(folder, number)
-    identity = create_log(path, to_json("identity", survey.identity).encode(), _rows(survey, plan))
+    identity = create_log(path, to_json("identity", survey.identity).encode(), _rows(survey, kept, compacted))
     with Log(path) as log:
         rows = read_back(log)
-        newest, compaction = (
-            None
-            if each is None or each.named is None
-            else replace(each.named, place=rows.place(log, each.last_sequence))
-            for each in (plan.start, plan.stand_in)
-        )
-    current = Current(number, identity, newest, compaction, plan.kept)
-    aside = _move_aside(survey, path)
+        named = [
+            None if each is None else replace(each, place=rows.place(log, each.last_sequence))
+            for each in (start, stand_in)
+        ]
+    current = Current(number, identity, *named, kept)
+    damaged = [*survey.spoilt, *(log_path(folder, other) for other in numbers(folder, LOG) if other != number)]
+    aside = {each: _put_aside(each) for each in damaged if each.exists()}
     write_current(folder, current)
     remove_unnamed(folder, current)
-    return Repair(plan.kept, lost, aside)
+    return Repair(kept, lost, aside.get(survey.path))
 
 
-def _taken(survey: Survey) -> Iterator[int]:
-    """Yield the numbers of logs, of those that were put aside, too, and of one that is gone."""
-    yield from log_numbers(survey.folder, unfinished=True)
-    for name in (survey.log.path.name, *(entry.name for entry in survey.folder.iterdir())):
-        stem = name.removeprefix(LOG).partition(DAMAGED)[0]
-        if is_number(stem):
-            yield int(stem)
-
-
-def _rows(survey: Survey, plan: _Plan) -> Iterator[tuple[int, bytes]]:
-    for sequence, row in survey.log.rows.items():
-        if sequence > plan.kept:
+def _rows(survey: Survey, kept: int, compacted: int) -> Iterator[tuple[int, bytes]]:
+    """Yield the rows up to `kept`, those up to `compacted` without arrays, and of these the ones that verify."""
+    assert survey.log is not None or not survey.rows
+    for sequence, (offset, size) in survey.rows.items():
+        if sequence > kept or survey.log is None:
             return
-        survey.progress("rows written", sequence, plan.kept)
-        if sequence > plan.compacted:
-            yield ROW, survey.log.data(sequence)
-        elif row.fault is not HEADLESS:
-            with suppress(DamageError, ValueError):
-                yield ROW, head_without_arrays(survey.log.head(sequence))
-
-
-def _move_aside(survey: Survey, new: Path) -> Path | None:
-    """Rename what is damaged; return the log's new name, or the one that it had already, None where it is gone.
-
-    new: the log that takes its place. Without `CURRENT` nobody knows which of others was the damaged one.
-    """
-    others = log_numbers(survey.folder) if survey.current is None else []
-    for other in (log_path(survey.folder, number) for number in others):
-        if other not in (new, survey.log.path):
-            _put_aside(other)
-    for found in survey.checkpoints:
-        if found.damage and found.folder.exists():
-            _put_aside(found.folder)
-    path = survey.log.path
-    if not path.exists() or DAMAGED in path.name:
-        return path if path.exists() else None
-    return _put_aside(path)
+        survey.progress("rows written", sequence, kept)
+        if sequence > compacted:
+            yield ROW, survey.log.read(offset, size)
+            continue
+        with suppress(DamageError, ValueError):
+            yield ROW, head_without_arrays(read_head(survey.log, offset, size))
 
 
 def _put_aside(path: Path) -> Path:

@@ -6,14 +6,14 @@ import math
 import struct
 from array import array
 from bisect import bisect_left, bisect_right
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from scroll_tactile_store.exceptions import DamageError
-from scroll_tactile_store.framing import Frame, LogPlace
+from scroll_tactile_store.exceptions import DamageError, RecordError
+from scroll_tactile_store.framing import LARGEST_PAYLOAD, Frame, LogPlace
 from scroll_tactile_store.log import Log, refuse
-from scroll_tactile_store.records import LARGEST_NUMBER, Head, check_key, check_text, from_json, payload_digest, to_json
+from scroll_tactile_store.records import LARGEST_NUMBER, Head, from_json, payload_digest, to_json
 
 ROW = 2  # the kind of a frame that holds a record
 
@@ -34,11 +34,22 @@ class JournalRow(NamedTuple):
 def encode_row(
     sequence: int, kind: str, label: str, key: bytes, time: float, attributes: str, payload: bytes | None, size: int
 ) -> bytes:
-    """Return the bytes of checked values: `attributes` as JSON, and of arrays that were given up their `size` alone."""
-    texts = (key, kind.encode(), label.encode(), attributes.encode())
-    kept = payload is not None
-    fields = FIELDS.pack(sequence, time, size, kept, *map(len, texts))
-    return b"".join((fields, payload_digest(fields, *texts), *texts, payload or b""))
+    """Return the bytes of a row: `attributes` as JSON, and of arrays that were given up their `size` alone.
+
+    Raises RecordError for values that cannot be kept.
+    """
+    try:
+        texts = (key, kind.encode(), label.encode(), attributes.encode())
+        if not math.isfinite(time):
+            raise ValueError("the time is no finite number of seconds since 1970")
+        fields = FIELDS.pack(sequence, time, size, payload is not None, *map(len, texts))
+        data = b"".join((fields, payload_digest(fields, *texts), *texts, payload or b""))
+        if len(data) > LARGEST_PAYLOAD:
+            raise ValueError(f"it has {len(data)} bytes, and at most {LARGEST_PAYLOAD} are kept")
+    except (AttributeError, TypeError, ValueError, struct.error) as error:
+        what = f"a row of kind {kind!r:.80}, label {label!r:.80}, key {key!r:.80} and time {time!r:.80}"
+        raise RecordError(f"{what} cannot be kept: {error}") from error
+    return data
 
 
 def head_without_arrays(head: Head) -> bytes:
@@ -47,17 +58,11 @@ def head_without_arrays(head: Head) -> bytes:
     return encode_row(head.sequence, head.kind, head.label, head.key, head.time, text, None, head.size)
 
 
-def _fields(data: bytes) -> tuple[Any, ...]:
-    if len(data) < HEAD_BYTES:
-        raise ValueError(f"a row has at least {HEAD_BYTES} bytes, not {len(data)}")
-    return FIELDS.unpack_from(data)
-
-
 def row_sequence(data: bytes) -> int:
     """Return the sequence of a row, of which these are the first HEAD_BYTES or more; raise ValueError for none."""
-    sequence: int = _fields(data)[0]
-    if not 1 <= sequence <= LARGEST_NUMBER:
-        raise ValueError(f"a row has the sequence {sequence}")
+    sequence = int.from_bytes(data[:8], "little")
+    if len(data) < HEAD_BYTES or not 1 <= sequence <= LARGEST_NUMBER:
+        raise ValueError(f"a row of {len(data)} bytes has the sequence {sequence}")
     return sequence
 
 
@@ -66,65 +71,50 @@ def key_prefix(key: bytes) -> int:
     return int.from_bytes(key[:8], "little")
 
 
-def _head_size(data: bytes, whole: int) -> int:
-    """Return the bytes of a row of `whole` bytes without its arrays; raise ValueError for no row."""
-    _, _, size, kept, *lengths = _fields(data)
-    end: int = HEAD_BYTES + sum(lengths)
-    if end + (size if kept else 0) != whole or kept > 1:
-        raise ValueError(f"a row of {whole} bytes says that it has {end} and {size}")
-    return end
-
-
 def decode_head(data: bytes, whole: int) -> Head:
     """Return the head of a row of `whole` bytes, of which `data` has the head, verified by its own digest.
 
     Raises ValueError for what `encode_row` never made.
     """
-    end = _head_size(data, whole)
-    if payload_digest(data[: FIELDS.size], data[HEAD_BYTES:end]) != data[FIELDS.size : HEAD_BYTES]:
-        raise ValueError("a row's head is not as it was written")
-    _, time, size, _, *lengths = FIELDS.unpack_from(data)
-    if size > LARGEST_NUMBER or not math.isfinite(time):
-        raise ValueError(f"a row has {size} bytes and the time {time}")
-    parts, start = [], HEAD_BYTES
+    sequence = row_sequence(data)
+    _, time, size, kept, *lengths = FIELDS.unpack_from(data)
+    parts, end = [], HEAD_BYTES
     for length in lengths:
-        parts.append(data[start : start + length])
-        start += length
+        parts.append(data[end : end + length])
+        end += length
+    if payload_digest(data[: FIELDS.size], *parts) != data[FIELDS.size : HEAD_BYTES] or end + kept * size != whole:
+        raise ValueError("a row's head is not as it was written")
     key, kind, label, attributes = parts
-    return Head(
-        row_sequence(data),
-        check_text("the kind", kind.decode()),
-        check_text("the label", label.decode()),
-        check_key(key),
-        time,
-        from_json(attributes.decode()),
-        size,
-    )
+    return Head(sequence, kind.decode(), label.decode(), key, time, from_json(attributes.decode()), size)
 
 
 def decode_row(data: bytes) -> JournalRow:
     """Return the record; raise ValueError for what `encode_row` never made."""
     head = decode_head(data, len(data))
-    return JournalRow(head, data[_head_size(data, len(data)) :] if FIELDS.unpack_from(data)[3] else None)
+    _, _, size, kept, *_ = FIELDS.unpack_from(data)
+    return JournalRow(head, data[len(data) - size :] if kept else None)
 
 
 def read_head(log: Log, offset: int, size: int) -> Head:
     """Return the head of the row in the frame at an offset. Raises DamageError, and ValueError for no row."""
     data = log.read(offset, size, first=USUAL_HEAD)
-    needed = _head_size(data, size)
+    row_sequence(data)
+    needed = HEAD_BYTES + sum(FIELDS.unpack_from(data)[4:])
     return decode_head(data if needed <= len(data) else log.read(offset, size, first=needed), size)
 
 
 class Rows:
     """Which rows a log holds, in order: of each its sequence, offset, size and the first bytes of its key.
 
-    first: the row before those that follow a place of the log, `begin`. whole: whether those before it are known, too.
+    first: the number that a checkpoint has reached, of which the log may have lost rows. table: of those known already,
+    as `table` gives it.
     """
 
-    def __init__(self, place: LogPlace, first: int = 0) -> None:
-        self.sequences, self.offsets, self.sizes, self.keys = array("Q"), array("Q"), array("Q"), array("Q")
-        self.columns = (self.sequences, self.offsets, self.sizes, self.keys)
-        self.first, self.begin, self.whole = first, place, first == 0
+    def __init__(self, first: int = 0, table: np.ndarray | None = None) -> None:
+        self.sequences, self.offsets, self.sizes, self.keys = self.columns = tuple(array("Q") for _ in range(4))
+        self.first = first
+        for column, values in zip(self.columns, () if table is None else table, strict=False):
+            column.frombytes(values.tobytes())
 
     def __len__(self) -> int:
         return len(self.keys)
@@ -160,19 +150,15 @@ class Rows:
         except ValueError as error:
             what = f"{log.path} has a frame that is no row (byte {frame.offset}): {error}"
             refuse(DamageError(what, path=log.path, offset=frame.offset), [])
-        self.append(sequence, frame.offset, frame.size, data[HEAD_BYTES : HEAD_BYTES + min(8, _fields(data)[4])])
+        self.append(
+            sequence, frame.offset, frame.size, data[HEAD_BYTES : HEAD_BYTES + min(8, FIELDS.unpack_from(data)[4])]
+        )
 
     def cut(self, place: LogPlace) -> None:
         """Forget the rows behind a place, behind which nothing is left."""
         count = bisect_left(self.offsets, place.offset)
         for column in self.columns:
             del column[count:]
-
-    def prepend(self, earlier: Rows) -> None:
-        """Add the rows before the first place."""
-        for column, before in zip(self.columns, earlier.columns, strict=True):
-            column[:0] = before
-        self.whole = True
 
     def find(self, after: int) -> int:
         """Return the index of the first row behind `after`."""
@@ -199,20 +185,10 @@ class Rows:
         count = self.find(last_sequence)
         return np.stack([np.frombuffer(column, np.uint64)[:count] for column in self.columns])
 
-    @classmethod
-    def of_table(cls, table: np.ndarray, until: LogPlace) -> Rows:
-        """Return the rows of a `table` that lie before a place. Raises ValueError where that is none."""
-        rows = cls(until)
-        if table.dtype != np.uint64 or table.ndim != 2 or len(table) != len(rows.columns):
-            raise ValueError(f"an index of rows is no array of {table.dtype.str} and shape {table.shape}")
-        for column, values in zip(rows.columns, table[:, table[1] < until.offset], strict=True):
-            column.frombytes(values.tobytes())
-        return rows
-
 
 def read_back(log: Log) -> Rows:
     """Return the rows of a log that was just written. Raises DamageError where it does not read back whole."""
-    rows = Rows(log.place)
+    rows = Rows()
     rows.catch_up(log)
     if log.place.offset != log.size():
         raise DamageError(

@@ -34,20 +34,21 @@ from scroll_tactile_store.exceptions import (
     RecordError,
     StoreClosedError,
     StoreError,
-    is_missing,
     reported,
 )
 from scroll_tactile_store.files import is_file, remove_tree, store_folder, sync_folder, tree_size
 from scroll_tactile_store.framing import LogPlace
 from scroll_tactile_store.layout import (
+    CHECKPOINT,
     CHECKPOINTS,
     CURRENT_FILE,
-    MOST_DIGITS,
+    LOG,
+    NEW,
+    PARTIAL,
     Current,
     NamedCheckpoint,
     checkpoint_path,
     holds_store,
-    log_numbers,
     log_path,
     numbers,
     read_current,
@@ -63,11 +64,7 @@ from scroll_tactile_store.records import (
     Checkpoint,
     Head,
     Record,
-    check_key,
-    check_text,
-    check_time,
     from_json,
-    plain_json,
     to_json,
 )
 from scroll_tactile_store.rows import ROW, Rows, decode_row, encode_row, head_without_arrays, read_back, read_head
@@ -75,7 +72,6 @@ from scroll_tactile_store.survey import Progress
 
 logger = logging.getLogger(__name__)
 
-LAST_SEQUENCE = 2**62  # far beyond what anybody appends
 ATTEMPTS = 8  # of a reader, while a writer puts another log in the place of the one
 
 
@@ -122,29 +118,23 @@ class Store:
             raise RecordError(f"mode must be 'write' or 'read', not {mode!r}")
         folder = store_folder(path)
         kept = None if identity is None else to_json("identity", identity)
-        if is_file(folder):
-            if mode == "write":
-                raise NotAStoreError(f'{folder} is a file: a packed store is opened with mode="read", or merged')
-        elif not holds_store(folder) and (mode == "read" or kept is None):
-            hint = "" if mode == "read" else "; give an identity to make one"
-            raise NotAStoreError(f"{folder} holds no store{hint}")
+        is_packed = mode == "read" and is_file(folder)
+        if not is_packed and not holds_store(folder) and (mode == "read" or kept is None):
+            raise NotAStoreError(f"{folder} holds no store; to make one, open it to write and give an identity")
         return cls(folder, kept, mode)
 
     def __init__(self, path: Path, identity: str | None, mode: Literal["write", "read"]) -> None:
         self.path = self._folder = path
         self.mode = mode
         self._process = os.getpid()
-        # Of the log and what is known of it; of `CURRENT` while it is written; of checkpoints, of which one is written
-        # at a time; and of the one that waits to be.
-        self._guard, self._naming = threading.RLock(), threading.Lock()
-        self._committing = threading.Lock()
+        # Of the log, `CURRENT` and what is known of them; of checkpoints, of which one is written at a time; and of the
+        # one that was handed over last.
+        self._guard, self._committing = threading.RLock(), threading.Lock()
         self._queue = threading.RLock()  # an executor may run what is handed over in the thread that hands it over
         self._closed = self._batching = self._failed = self._unsettled = False
         self._lock: WriterLock | None = None
         self._worker = ThreadPoolExecutor(1, f"store commit {path.name}")
-        self._waiting: CheckpointDraft | None = None
-        self._submitted: Future[None] | None = None
-        self._failure: Exception | None = None
+        self._later: Future[None] | None = None
         with ExitStack() as undo:
             if mode == "write":
                 self._lock = lock_to_write(path, identity)
@@ -152,7 +142,7 @@ class Store:
             elif is_file(path):
                 self._folder = undo.enter_context(unpacked(path))
             with reported(path, "opening the store"):
-                self._take_current()
+                self._current, self._log, self._rows = self._take_current()
             undo.callback(lambda: self._log.close(trim=mode == "write"))
             if mode == "write":
                 self._remove_unnamed()
@@ -172,8 +162,8 @@ class Store:
 
     # What `CURRENT` names.
 
-    def _take_current(self) -> None:
-        """Use the log that `CURRENT` names now, read from the newest checkpoint's place on."""
+    def _take_current(self) -> tuple[Current, Log, Rows]:
+        """Return what `CURRENT` says now, the log that it names, and the rows of that."""
         for _ in range(ATTEMPTS):
             current = read_current(self._folder / CURRENT_FILE)
             path = log_path(self._folder, current.log)
@@ -190,27 +180,26 @@ class Store:
         else:
             raise StoreError(f"{self.path} is compacted again and again: open it later")
         try:
-            rows, identity = self._read(current, log), from_json(log.header.decode())
+            rows = self._read(current, log)
+            self.identity: Mapping[str, JSON] = from_json(log.header.decode())
         except BaseException as error:
             log.close()
             if isinstance(error, ValueError):
                 what = f"the identity in {log.path} was never written so: {error}"
                 raise DamageError(what, path=log.path) from error
             raise
-        self._current, self._log, self._rows = current, log, rows
-        self.identity: Mapping[str, JSON] = identity
+        return current, log, rows
 
     def _read(self, current: Current, log: Log) -> Rows:
         if log.identity != current.log_identity:
             raise DamageError(f"{log.path} is the log of another store, or of another time", path=log.path)
-        rows = Rows(log.place)
+        rows = Rows()
         if (named := current.newest) is not None:
             if not log.has_place(named.place):
                 what = f"{log.path} holds no batch that ends where checkpoint {named.number} says"
                 raise DamageError(f"{what}: repair the store (repair_store)", path=log.path)
-            log.place = named.place
-            rows = Rows(named.place, named.last_sequence)
-        rows.whole |= log.place == log.first
+            rows = Rows(named.last_sequence, self._index(named, log))
+            log.place = named.place if len(rows) else log.place
         rows.catch_up(log, current.last)
         if self.mode == "write":
             log.prepare()
@@ -218,25 +207,27 @@ class Store:
             sync_folder(self._folder)
         return rows
 
+    def _index(self, named: NamedCheckpoint, log: Log) -> np.ndarray | None:
+        """Return where the newest checkpoint says that the rows before its place are; None where it does not say so."""
+        name = index_name(log.identity)
+        try:
+            reader = CheckpointReader(checkpoint_path(self._folder, named.number))
+            if reader.sha256 == named.sha256 and name in reader.names:
+                table = reader.arrays([name])[name].astype(np.uint64)
+                return table[:, table[1] < named.place.offset]
+        except (StoreError, LookupError) as error:
+            logger.info("%s: rows are looked for in the log itself: %s", log.path, error)
+        return None
+
     @contextmanager
     def _using(self, doing: str) -> Iterator[None]:
         """In the block nobody else uses the log, which is the one that counts."""
         self._check_open()  # before the lock, which in a fork nobody gives back
         with self._guard, reported(self.path, doing):
             self._check_open()  # another thread may have closed it meanwhile
-            if self._unsettled:
-                self._settle()
+            if self._unsettled and not self._batching:
+                self._renew()
             yield
-
-    def _settle(self) -> None:
-        """Find out what `CURRENT` names, and make it durable: what wrote it failed, or has put another log in place."""
-        current = read_current(self._folder / CURRENT_FILE)
-        if current.log == self._current.log:
-            self._current = current
-            sync_folder(self._folder)
-        else:
-            self._renew()
-        self._unsettled = False
 
     def _settled(self) -> Current:
         with self._using("looking for what counts"):
@@ -244,7 +235,8 @@ class Store:
 
     def _renew(self) -> None:
         before = self._log
-        self._take_current()
+        self._current, self._log, self._rows = self._take_current()
+        self._unsettled = False
         before.close()
 
     def _look(self) -> None:
@@ -305,30 +297,19 @@ class Store:
         ReadOnlyError or another StoreError; after any of them the store can be used on.
         """
         self._check_open(write=True)
-        check_text("the kind", kind)
-        check_text("the label", label)
-        check_key(key)
-        seconds = check_time(clock.time() if time is None else time)
-        known, text = plain_json("attributes", attributes)
-        payload = encode_payload(check_arrays(arrays))
+        seconds = clock.time() if time is None else time
+        text, payload = to_json("attributes", attributes), encode_payload(check_arrays(arrays))
         with self._using("appending a row"):
             if self._batching and self._failed:
                 raise StoreError(f"nothing more can be appended to {self.path} in this batch: a row of it failed")
-            if (sequence := self._rows.last + 1) > LAST_SEQUENCE:
-                raise DamageError(f"{self._log.path} has a row of number {sequence - 1}", path=self._log.path)
+            sequence = self._rows.last + 1
             data = encode_row(sequence, kind, label, key, seconds, text, payload, len(payload))
-            try:
+            with self._undoing():
                 frame = self._log.stage(ROW, data)
                 self._rows.append(sequence, frame.offset, frame.size, key)
                 if not self._batching:
                     self._make_durable()
-            except RecordError:  # nothing of it was staged
-                raise
-            except BaseException:
-                self._failed = True
-                self._undo()
-                raise
-        return Head(sequence, kind, label, key, seconds, known, len(payload))
+        return Head(sequence, kind, label, key, float(seconds), from_json(text), len(payload))
 
     @contextmanager
     def batch(self) -> Iterator[None]:
@@ -346,13 +327,12 @@ class Store:
             with self._using("beginning a batch"):
                 self._batching, self._failed = True, False
             try:
-                yield
-                if self._failed:
-                    raise StoreError(f"nothing of this batch was kept in {self.path}: a row of it failed")
-                self._make_durable()
-            except BaseException:
-                self._undo()
-                raise
+                with self._undoing():
+                    yield
+                    if self._failed:
+                        raise StoreError(f"nothing of this batch was kept in {self.path}: a row of it failed")
+                    with reported(self.path, "making a batch durable"):
+                        self._make_durable()
             finally:
                 self._batching = False
 
@@ -361,10 +341,16 @@ class Store:
         if not self._current.last and self._rows.last:
             self._note_last()  # without any row the log would look like a new one
 
-    def _undo(self) -> None:
-        """Take back what is not durable; what was committed before an interruption stays, and is known."""
-        self._rows.cut(self._log.place)
-        self._log.rollback()
+    @contextmanager
+    def _undoing(self) -> Iterator[None]:
+        """Where the block fails, take back what is not durable; what was committed before stays, and is known."""
+        try:
+            yield
+        except BaseException:
+            self._failed = True
+            self._rows.cut(self._log.place)
+            self._log.rollback()
+            raise
 
     def _refuse_in_batch(self, doing: str) -> None:
         """Raise StoreError in a batch of this thread, and wait for the end of another thread's."""
@@ -374,24 +360,26 @@ class Store:
 
     def _note_last(self) -> None:
         """Have `CURRENT` say which row is the last, so that a log that is cut off later is not taken for whole."""
-        last = self._rows.last
         try:
-            with self._naming:
-                if replace(read_current(self._folder / CURRENT_FILE), last=0) == replace(self._current, last=0):
-                    current = replace(self._current, last=last)
-                    write_current(self._folder, current)
-                    self._current = current
+            if read_current(self._folder / CURRENT_FILE) == self._current:  # the folder may be another's by now
+                self._name(self._current)
         except (OSError, StoreError) as error:  # nothing is lost but this knowledge
-            logger.warning("%s could not say that row %d is the last: %s", self._folder / CURRENT_FILE, last, error)
+            logger.warning("%s could not say which row is the last: %s", self._folder / CURRENT_FILE, error)
 
-    def heads(self, after: int = 0, *, kind: str | None = None, label: str | None = None) -> Iterator[Head]:
+    def _name(self, current: Current) -> None:
+        """Write `CURRENT`, with the last row that is durable."""
+        self._unsettled = True  # where it fails, it may be another than before, or only in the system's memory
+        current = replace(current, last=self._rows.last)
+        write_current(self._folder, current)
+        self._current, self._unsettled = current, current.log != self._current.log
+
+    def heads(self, after: int = 0, *, kind: str | None = None) -> Iterator[Head]:
         """Yield the records behind sequence `after` without their arrays, up to the last at the start.
 
-        `kind`, `label`: only those of this kind, or label. Compacted records keep their heads, but for those that a
-        repair named as lost. Raises DamageError at the first that is damaged or missing.
+        `kind`: only those of this kind. Compacted records keep their heads, but for those that a repair named as lost.
+        Raises DamageError at the first that is damaged or missing.
         """
-        found = self._rows_behind(after, arrays=False)
-        return (head for head in found if kind in (None, head.kind) and label in (None, head.label))
+        return (head for head in self._rows_behind(after, arrays=False) if kind in (None, head.kind))
 
     def record(self, sequence: int) -> Record:
         """Return the record of this sequence.
@@ -402,7 +390,9 @@ class Store:
             last = self._rows.last
             if type(sequence) is not int or not 1 <= sequence <= last:
                 raise RecordError(f"{self.path} has records 1 to {last}, not {sequence!r}")
-            return cast(Record, self._row(sequence, arrays=True))
+            if (row := self._row_behind(sequence - 1, sequence, arrays=True)) is None:
+                raise self._given_up(sequence)  # a repair left it out
+            return cast(Record, row)
 
     def records(self, after: int = 0) -> Iterator[Record]:
         """Yield the records behind sequence `after`, verified and in order, up to the last at the start.
@@ -417,14 +407,12 @@ class Store:
 
     def with_key(self, key: bytes) -> Iterator[Head]:
         """Yield the records with this key without their arrays. Raises DamageError."""
-        check_key(key)
         with self._using("looking for a key"):
-            self._find(0)
             sequences = self._rows.with_key(key)
         for sequence in sequences:
             with self._using("reading a row"):
-                head = self._row(sequence, arrays=False)
-            if head.key == key:
+                head = self._row_behind(sequence - 1, sequence, arrays=False)
+            if head is not None and head.key == key:
                 yield head
 
     def _rows_behind(self, after: int, *, arrays: bool) -> Iterator[Head]:
@@ -434,61 +422,34 @@ class Store:
         def rows(after: int) -> Iterator[Head]:
             while after < last:
                 with self._using(f"reading rows behind {after}"):
-                    if (after := self._next_row(after, last)) > last:
-                        return  # those that are left gave up their arrays, and a repair left them out
-                    head = self._row(after, arrays=arrays)
+                    head = self._row_behind(after, last, arrays=arrays)
+                if head is None:
+                    return  # those that are left gave up their arrays, and a repair left them out
                 yield head
+                after = head.sequence
 
         return rows(after)
 
-    def _find(self, after: int) -> int:
-        """Return the index of the first row behind `after`, once all rows from there on are known."""
-        if after < self._rows.first and not self._rows.whole:
-            self._rows.prepend(self._rows_before(self._rows.begin))
-        return self._rows.find(after)
+    def _row_behind(self, after: int, last: int, *, arrays: bool) -> Head | None:
+        """Return the first row behind one and up to `last`, verified, None where there is none; arrays: as a record.
 
-    def _rows_before(self, place: LogPlace) -> Rows:
-        """Return the rows before a place, as the newest checkpoint has them, or else the log itself."""
-        named, name = self._current.newest, index_name(self._log.identity)
-        try:
-            if named is not None and named.place.offset >= place.offset and self._log.has_place(named.place):
-                reader = CheckpointReader(checkpoint_path(self._folder, named.number))
-                if reader.sha256 == named.sha256 and (found := reader.arrays([name])):
-                    return Rows.of_table(found[name], place)
-        except (StoreError, ValueError) as error:
-            if not is_missing(error):  # as where a writer has replaced it
-                logger.warning("%s: rows are looked for in the log itself: %s", self._log.path, error)
-        log, end = self._log, self._log.place
-        rows, log.place = Rows(log.first), log.first
-        try:
-            rows.catch_up(log)
-        finally:
-            log.place = end
-        rows.cut(place)
-        return rows
-
-    def _next_row(self, after: int, last: int) -> int:
-        """Return the first row behind `after`, or one behind `last`. Raises DamageError where one is missing."""
-        index = self._find(after)
-        found = self._rows.sequences[index] if index < len(self._rows) else last + 1
+        Raises DamageError, also where one is missing, and CompactedError for compacted arrays.
+        """
+        index = self._rows.find(after)
+        sequence = self._rows.sequences[index] if index < len(self._rows) else last + 1
         # Of compacted ones a repair may have left some out.
-        first, through = 1 + max(after, self._current.compacted), min(found - 1, last)
+        first, through = 1 + max(after, self._current.compacted), min(sequence - 1, last)
         if first <= through:
             missing = f"row {through} is missing" if first == through else f"rows {first} to {through} are missing"
             raise self._damage(f"{missing} from", through)
-        return found
-
-    def _row(self, sequence: int, *, arrays: bool) -> Head:
-        """Return a row, verified; arrays: as a record. Raises DamageError, and CompactedError for compacted arrays."""
-        if self._next_row(sequence - 1, sequence) != sequence:
-            raise self._given_up(sequence)  # a repair left it out
-        index = self._rows.find(sequence - 1)
+        if sequence > last:
+            return None
         offset, size = self._rows.offsets[index], self._rows.sizes[index]
         try:
-            if not arrays:
-                head, payload = read_head(self._log, offset, size), None
-            else:
+            if arrays:
                 head, payload = decode_row(self._log.read(offset, size))
+            else:
+                head, payload = read_head(self._log, offset, size), None
             if head.sequence != sequence:
                 raise ValueError(f"it has the number {head.sequence}")
             if not arrays:
@@ -556,11 +517,8 @@ class Store:
     def _load(self, named: NamedCheckpoint) -> Checkpoint:
         path = checkpoint_path(self._folder, named.number)
         reader = CheckpointReader(path)
-        known = (reader.number, reader.last_sequence, reader.sha256, dict(reader.identity))
-        if known != (named.number, named.last_sequence, named.sha256, self.identity):
-            raise DamageError(
-                f"{path} is another checkpoint than the one that is named, or of another store", path=path
-            )
+        if reader.sha256 != named.sha256:
+            raise DamageError(f"{path} is another checkpoint than the one that is named", path=path)
         return Checkpoint(named.number, named.last_sequence, reader.attributes, reader.arrays())
 
     def commit(self, arrays: Arrays, *, last_sequence: int, attributes: Attributes = None) -> int:
@@ -578,15 +536,18 @@ class Store:
     def commit_later(self, arrays: Arrays, *, last_sequence: int, attributes: Attributes = None) -> None:
         """Do as `commit` in a background thread; the arrays are handed over and must not change any more.
 
-        While one is being written, only the newest of those handed over waits. A failure is logged and raised, once, by
-        the next `commit`, `commit_later` (which then queues nothing), `flush` or `close`. What cannot be kept is
-        refused at once, with RecordError. While the interpreter ends nothing is written: the log holds the rows.
+        While one is being written, only the newest of those handed over waits. A failure is logged, and that of the
+        last one raised, once, by the next `commit`, `commit_later` (which then queues nothing), `flush` or `close`.
+        What cannot be kept is refused at once, with RecordError. While the interpreter ends nothing is written: the
+        log holds the rows.
         """
         draft = self._draft(arrays, last_sequence, attributes)
-        self._raise_failure()
+        if self._later is not None and self._later.done():
+            self._idle()
         with self._queue, suppress(RuntimeError):  # it starts no job any more
-            self._waiting = draft
-            self._submitted = self._worker.submit(self._commit_newest)
+            earlier, self._later = self._later, self._worker.submit(self._commit_later, draft)
+            if earlier is not None:
+                earlier.cancel()
 
     def _draft(self, arrays: Arrays, last_sequence: int, attributes: Attributes) -> CheckpointDraft:
         self._check_open(write=True)
@@ -603,75 +564,49 @@ class Store:
     def _commit(self, draft: CheckpointDraft) -> int:
         with self._committing:
             with self._using("looking where rows are"):
-                self._find(0)
-                current, place = self._current, self._rows.place(self._log, draft.last_sequence)
+                log, place = self._current.log_identity, self._rows.place(self._log, draft.last_sequence)
                 table = self._rows.table(draft.last_sequence)
-            named = self._write(draft, place, current.log_identity, table)
-            if current.newest is None or named.last_sequence >= current.newest.last_sequence:
-                # When this fails all folders stay, for the next commit or open to remove: what could not be synced may
-                # be on the disk all the same, and count after a crash.
-                with self._using("looking for the last row"):
-                    current = replace(self._current, newest=named, last=self._rows.last)
-                self._name(current)
+            named = self._write(draft, place, log, table)
+            # When this fails all folders stay, for the next commit or open to remove: what could not be synced may
+            # be on the disk all the same, and count after a crash.
+            with self._using("committing"):
+                newest = self._current.newest
+                if newest is None or named.last_sequence >= newest.last_sequence:
+                    self._name(replace(self._current, newest=named))
             self._remove_unnamed()
             return named.number
 
-    def _name(self, current: Current) -> None:
-        """Write `CURRENT`, with the same log."""
-        with reported(self.path, "committing"):
-            try:
-                with self._naming:
-                    current = replace(current, last=max(current.last, self._current.last))
-                    write_current(self._folder, current)
-            except BaseException:
-                # It may be another than before, or only in the system's memory.
-                with self._guard:
-                    self._unsettled = True
-                raise
-        with self._using("committing"):
-            self._current = current
-
     def _write(self, draft: CheckpointDraft, place: LogPlace, log: bytes, table: np.ndarray) -> NamedCheckpoint:
         """Write a draft, with which rows are where in a log."""
-        number = self._next(numbers(self._folder, unfinished=True))
+        number = 1 + max(numbers(self._folder, CHECKPOINT, PARTIAL), default=0)
         draft = replace(draft, arrays={**draft.arrays, index_name(log): table})
         sha256 = write_checkpoint(self._folder, number, draft, self.identity)
         return NamedCheckpoint(number, draft.last_sequence, sha256, place)
 
-    def _next(self, taken: list[int]) -> int:
-        number = 1 + max(taken, default=0)
-        if number >= 10**MOST_DIGITS:
-            raise DamageError(f"{self.path} has a log or a checkpoint of number {number - 1}", path=self.path)
-        return number
-
-    def _commit_newest(self) -> None:
-        with self._queue:
-            draft, self._waiting = self._waiting, None
-        if draft is None:
-            return
+    def _commit_later(self, draft: CheckpointDraft) -> None:
         try:
             self._commit(draft)
         except Exception as error:
             if isinstance(error, RuntimeError) and "interpreter shutdown" in str(error):
                 return  # no thread starts a job any more, without which zarr writes nothing
             logger.exception("%s: a background commit failed; the journal still holds its rows", self.path)
-            self._failure = error
+            if isinstance(error, StoreError):
+                raise
+            raise StoreError(f"a background commit failed: {error!r}") from error
 
     def _wait(self) -> None:
-        if self._submitted is not None:
-            wait_for([self._submitted])
-
-    def _raise_failure(self) -> None:
-        with self._queue:
-            failure, self._failure = self._failure, None
-        if failure is not None and not isinstance(failure, StoreError):
-            raise StoreError(f"a background commit failed: {failure!r}") from failure
-        if failure is not None:
-            raise failure
+        if (later := self._later) is not None:
+            wait_for([later])
 
     def _idle(self) -> None:
-        self._wait()
-        self._raise_failure()
+        """Wait for what was handed over, and raise its failure, once."""
+        while (later := self._later) is not None:
+            self._wait()
+            with self._queue:
+                if self._later is not later:  # another thread was here meanwhile
+                    continue
+                self._later = None
+            later.result()
 
     def flush(self) -> None:
         """Return when what was handed to `commit_later` is committed; raise the failure if it is not."""
@@ -714,24 +649,13 @@ class Store:
             with self._using("putting another log in place"):
                 if last_sequence < self._current.compacted:  # another thread compacted meanwhile
                     raise RecordError(f"{self.path} was compacted up to {self._current.compacted} meanwhile")
-                current = self._compacted(drafts)
-                try:
-                    write_current(self._folder, current)
-                finally:
-                    # A sync that failed leaves it open which of the two is named.
-                    self._unsettled = True
-                try:
-                    with self._using("opening the log that took its place"):
-                        pass
-                except StoreError as error:  # it stands; whoever uses it next opens it, or learns why that cannot be
-                    logger.warning(
-                        "%s: the log that took the place of another could not be opened yet: %s", self.path, error
-                    )
+                self._name(self._compacted(drafts))
+            # This opens the log that took its place. Where it cannot, whoever uses the store next does, or learns why.
             self._remove_unnamed()
 
     def _compacted(self, drafts: list[CheckpointDraft]) -> Current:
         """Write a log in which rows have no arrays, and the checkpoints that stand for them; read all of it back."""
-        number = self._next(log_numbers(self._folder, unfinished=True))
+        number = 1 + max(numbers(self._folder, LOG, NEW), default=0)
         path = log_path(self._folder, number)
         try:
             header, last_sequence = to_json("identity", self.identity).encode(), drafts[0].last_sequence
@@ -748,15 +672,16 @@ class Store:
         except BaseException:
             remove_tree(path)
             raise
-        return Current(number, identity, named[-1], named[0], self._rows.last)
+        return Current(number, identity, named[-1], named[0])
 
     def _payloads(self, last_sequence: int) -> Iterator[bytes]:
         """Yield the bytes of each row in order, of those up to `last_sequence` without their arrays."""
-        self._find(0)
         rows = self._rows
         for index, sequence in enumerate(rows.sequences):
             if sequence <= last_sequence:
-                yield head_without_arrays(self._row(sequence, arrays=False))
+                head = self._row_behind(sequence - 1, sequence, arrays=False)
+                assert head is not None
+                yield head_without_arrays(head)
                 continue
             try:
                 yield self._log.read(rows.offsets[index], rows.sizes[index])
@@ -800,7 +725,7 @@ class Store:
             if self.mode == "write" and self._current.last < self._rows.last:
                 self._note_last()
             self._held.close()
-        self._raise_failure()
+        self._idle()
 
     def __enter__(self) -> Self:
         self._check_open()

@@ -11,19 +11,19 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from scroll_tactile_store import backup, checkpoint_files, layout, log, repair, rows
+from scroll_tactile_store import backup, checkpoint_files, layout, log, rows, survey
 from scroll_tactile_store.records import Checkpoint
 from scroll_tactile_store.store import Store
 
 from faults.planting import BUGS, Replacement, bug, nothing
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import MEMBER, MERGE, OBSERVE
-from scroll_tactile.persistence import ledger, merge, packing, replaying
+from scroll_tactile.persistence import ledger, merge, replaying
 
 
 @bug("a frame's payload is not verified", log.Log, "_payload")
 def _payload_as_it_is(_: Any, self: Any, frame: Any, begin: bytes) -> Any:
-    return self._at(frame.payload_offset, frame.size)
+    return self.at(frame.payload_offset, frame.size)
 
 
 @bug("CURRENT is not verified", layout.Current, "from_bytes")
@@ -86,7 +86,7 @@ def _other_log_not_noticed(_: Any, self: Any) -> None:
 def _any_index_is_of_this_log(arrays: Any, self: Any, names: Any = None) -> Any:
     found = arrays(self, names)
     if not found and names and next(iter(names)).startswith(checkpoint_files.INDEX):
-        own = [name for name in self._files if name.startswith(checkpoint_files.INDEX)]
+        own = [name for name in self.names if name.startswith(checkpoint_files.INDEX)]
         found = dict.fromkeys(names, *arrays(self, own).values()) if own else {}
     return found
 
@@ -159,8 +159,7 @@ def _kept_not_retracted(chosen: Any, memory: Any, given: Any, last_sequence: int
     return fresh
 
 
-@bug("a retraction is lost in a merge", merge, "active_rows")
-@bug("a retraction is lost in packing", packing, "active_rows")
+@bug("a retraction is lost in a merge or in packing", merge, "active_rows")
 def _retracted_rows_too(_: Any, heads: Any) -> Any:
     return [head for head in heads if head.kind in (OBSERVE, MERGE, MEMBER)]
 
@@ -170,9 +169,9 @@ def _nothing_there(*_: Any) -> Any:
     return set(), []
 
 
-@bug("a packed memory is counted twice", merge, "sums_without")
-def _nothing_left_out(sums: Any, source: Any, newest: Any, memory: Any, left_out: Any) -> Any:
-    return sums(source, newest, memory, set())
+@bug("a packed memory is counted twice", merge.Merge, "_summed")
+def _nothing_left_out(_: Any, self: Any, whole: Any) -> Any:
+    return whole
 
 
 @bug("a description is lost in a merge", merge.Merge, "_chosen_descriptions")
@@ -180,6 +179,6 @@ def _all_but_the_first(described: Any, *given: Any) -> Any:
     return dict(list(described(*given).items())[1:])
 
 
-@bug("a repair keeps rows behind damage", repair._Plan, "of")
-def _all_kept(of: Any, cls: Any, survey: Any) -> Any:
-    return dataclasses.replace(of(cls, survey), kept=survey.last)
+@bug("a repair keeps rows behind damage", survey.Survey, "faulty")
+def _nothing_behind(faulty: Any, self: Any, first: int, last: int) -> Any:
+    return faulty(self, first, last) if first == 1 or last < self.last else []

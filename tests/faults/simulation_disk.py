@@ -7,6 +7,7 @@ import random
 import re
 import shutil
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -82,11 +83,25 @@ class Disks(Disk):
         self.top.sync()
 
 
-class Job:
+class Job(Future[None]):
     """A background commit that waits for its turn."""
 
-    def __init__(self, held: Held) -> None:
-        self._held = held
+    def __init__(self, held: Held, do: Callable[[], None]) -> None:
+        super().__init__()
+        self._held, self._do = held, do
+
+    def __call__(self) -> None:
+        """Do it now, unless a later one has taken its place."""
+        if not self.set_running_or_notify_cancel():
+            return
+        try:
+            self.set_result(self._do())
+        except Exception as error:
+            self.set_exception(error)
+
+    def failed(self) -> bool:
+        """Whether it was done, and in vain."""
+        return self.done() and self.exception() is not None
 
     def wait(self) -> None:
         """Do what waits."""
@@ -99,14 +114,15 @@ class Held:
     at_once = False
 
     def __init__(self, *_: Any) -> None:
-        self.jobs: list[Any] = []
+        self.jobs: list[Job] = []
 
-    def submit(self, job: Any) -> Job:
+    def submit(self, do: Any, *given: Any) -> Job:
         """Take a job."""
+        job = Job(self, partial(do, *given))
         self.jobs.append(job)
         if Held.at_once:
             self.run()
-        return Job(self)
+        return job
 
     def run(self) -> None:
         """Do all that waits."""

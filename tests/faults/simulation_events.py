@@ -30,10 +30,10 @@ def interleaved(place: int, between: Callable[[], None]) -> Iterator[None]:
             left.clear()
             between()
 
-    def copied(*given: Any) -> None:
+    def copied(*given: Any, **named: Any) -> None:
         due(left == [1])
         left[:] = [count - 1 for count in left]
-        copy(*given)
+        copy(*given, **named)
 
     def read(*given: Any, **named: Any) -> Any:
         due(True)

@@ -163,7 +163,7 @@ class World:
         Held.at_once = rng.random() < 0.3
         before, (now, foretold) = machine.state, then
         held = None if machine.learner is None else machine.learner._ledger.store
-        late = held is not None and held._failure is not None  # closing tells of it
+        late = held is not None and held._later is not None and held._later.failed()  # closing tells of it
         fail = None
         if kind == "full":
             first = 1 + int(about[0] ** 3 * 400) if rng.random() < 0.5 else rng.randint(1, 12)

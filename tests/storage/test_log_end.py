@@ -69,7 +69,7 @@ def test_a_crashed_log_that_ends_before_a_checkpoints_place_is_named(tmp_path, b
         with pytest.raises(DamageError, match="repair the store"):
             Store.open(path, mode=mode)
     # Without the commit frame alone the row is whole, and the place tells of what is behind it.
-    assert [problem.kind for problem in damage(path)] == ["spare" if by <= FRAME_BYTES else "lost", "spare"]
+    assert {problem.kind for problem in damage(path)} == ({"spare"} if by <= FRAME_BYTES else {"lost", "spare"})
     assert repair_store(path).kept == 2
     assert damage(path) == []
 

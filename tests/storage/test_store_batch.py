@@ -45,7 +45,7 @@ def test_a_refused_record_is_not_part_of_a_batch_that_goes_on(opened):
     with opened.batch():
         add(opened, "one")
         with pytest.raises(RecordError):
-            opened.append("a", "\0", b"")
+            opened.append("a", "\ud800", b"")
         assert add(opened, "two") == [3]
     assert labels(opened) == ["before", "one", "two"]
 

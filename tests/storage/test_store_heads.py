@@ -18,7 +18,7 @@ def sequences(rows):
     return [row.sequence for row in rows]
 
 
-def test_heads_behind_a_row_of_one_kind_or_label(opened):
+def test_heads_behind_a_row_of_one_kind(opened):
     heads = opened.heads(8)
     opened.append("add", "late", b"")
     assert sequences(heads) == [9, 10]  # up to the last when they were asked for
@@ -27,8 +27,6 @@ def test_heads_behind_a_row_of_one_kind_or_label(opened):
         ({"after": 99}, []),
         ({"kind": "take"}, [3, 6, 9]),
         ({"after": 3, "kind": "take"}, [6, 9]),
-        ({"label": "wool"}, [2, 4, 6, 8, 10]),
-        ({"kind": "take", "label": "é'\"\U0001f9f6"}, [3, 9]),
         ({"kind": "wool"}, []),
     ):
         assert sequences(opened.heads(**asked)) == expected
@@ -45,8 +43,6 @@ def test_damaged_heads_are_named(opened):
         with pytest.raises(DamageError, match="row 6 is") as caught:
             next(rows)
         assert sequences(reader.heads(caught.value.sequence)) == [7, 8, 9, 10]
-        with pytest.raises(DamageError, match="row 6 is"):
-            list(reader.heads(label="wool"))
         with pytest.raises(DamageError, match="row 6 is"):
             list(reader.with_key(b"\6"))
 

@@ -86,7 +86,7 @@ class History(RuleBasedStateMachine):
 
     @rule()
     def refuse(self):
-        wrong = [lambda: self.store.append("a", "\0", b""), lambda: self.store.commit({}, last_sequence=10**6)]
+        wrong = [lambda: self.store.append("a", "\ud800", b""), lambda: self.store.commit({}, last_sequence=10**6)]
         if self.compacted:
             wrong += [lambda: self.store.commit({}, last_sequence=self.compacted - 1)]
             wrong += [lambda: self.store.compact({}, last_sequence=self.compacted - 1)]

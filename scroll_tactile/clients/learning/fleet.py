@@ -42,7 +42,7 @@ from scroll_tactile.errors import CapacityError, InputError, MismatchError, Rang
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.memory.identity import Identity
 from scroll_tactile.memory.touch_rows import SOURCE
-from scroll_tactile.persistence.merge import Choice, MergeRules
+from scroll_tactile.persistence.merge import Choice
 from scroll_tactile.quantities import Quantity, require_declarable
 from scroll_tactile.recipe import Recipe, RecipeRequest
 from scroll_tactile.recordings.locations import local
@@ -354,9 +354,9 @@ class _Run:
 
     def _merge(self, path: Path, clipped: Collection[bytes] = (), source: str = "") -> None:
         """Merge a memory, each touch once. clipped: as of `Learned`. source: of touches that have none."""
-        rules = MergeRules(True, self._descriptions, clipped, source or None)
+        how: Any = {"choice": self._descriptions, "one_name": True, "clipped": clipped, "source": source or None}
         merged, refused = self._learner._ledger.merge(
-            path, rules, lambda what, done, of: self._show(f"{what} {done} of {of} touches")
+            path, lambda what, done, of: self._show(f"{what} {done} of {of} touches"), **how
         )
         self._report.repeated += merged.shared
         self._report.refused += [Refused(str(head.attributes.get(SOURCE, source)), why) for head, why in refused]

@@ -55,11 +55,11 @@ class Delimited(Text):
             raise RecordingError(f"expected readings in {address}, one row each; there are none")
         lines = [line for _, line in head if not line.startswith(("#", "%"))] or [line for _, line in head]
         self.layout = Layout.of(lines, delimiter, request.decimal)
-        self.point = self.layout.decimal == "."
         rows = [(row, line, self.layout.cells(line)) for row, line in head]
         self.width = usual([self.layout.cells(line) for line in lines])
         if self.width > _MOST_COLUMNS:
             raise RecordingError(f"{address} has {self.width} columns; expected at most {_MOST_COLUMNS}")
+        self.episode, self.said = 0, ""
         self._understand(rows)
 
     @classmethod
@@ -84,7 +84,6 @@ class Delimited(Text):
         """The rows, a number of them at a time."""
         most = rows_of(8 * self.width)
         lines = ((row, line) for row, line in self.lines() if row >= self.begin)
-        self.episode, self.said = 0, None
         last = None  # is given when all are read, and what was odd is known
         while batch := list(itertools.islice(lines, most)):
             block = self._block(batch)
@@ -99,65 +98,53 @@ class Delimited(Text):
 
     def _block(self, batch: list[tuple[int, str]]) -> Block:
         rows: list[tuple[int, list[str]]] = []
-        table = self._whole(batch)
-        if table is None:
-            split = ((row, line, self.layout.cells(line)) for row, line in batch)
-            rows = [(row, cells) for row, line, cells in split if self._fits(row, line, cells)]
+        if (table := self._whole(batch)) is None:
+            rows = [(row, self.layout.cells(line)) for row, line in batch]
+            rows = [each for each, (_, line) in zip(rows, batch, strict=True) if self._fits(*each, line)]
             table = self._flat(rows)
         if table is None:
-            sound = []
-            for row, cells in rows:
-                try:
-                    sound.append((row, cells, self._values(row, cells)))
-                except RecordingError as error:
-                    self.leave_out(row, error)
-            rows = [(row, cells) for row, cells, _ in sound]
-            table = np.array([values for *_, values in sound]).reshape(len(rows), len(self.wanted))
-        clocks = {}
+            found = [self._values(row, cells) for row, cells in rows]
+            rows = [each for each, values in zip(rows, found, strict=True) if values is not None]
+            table = np.array([values for values in found if values is not None], np.float64)
+        table, clocks = table.reshape(-1, len(self.wanted)), {}
         if self.time is not None:
             name, unit = self.columns[self.time], self.units[self.time]
-            clocks = {name: in_seconds(table[:, -1], name, unit)}
-            table = table[:, :-1]
+            clocks, table = {name: in_seconds(table[:, -1], name, unit)}, table[:, :-1]
         self.empty += int(np.isnan(table).all(axis=1).sum())
         return Block(table, clocks, {}, self._episodes([cells for _, cells in rows]))
 
     def _whole(self, batch: list[tuple[int, str]]) -> Floats | None:
-        """The numbers by numpy's parser; None where a row needs a closer look, as all do once three blocks did."""
-        if self.label is not None or self.slow > 2 or batch[-1][0] == self.unended:
-            return None
-        lines = [line if self.point else line.replace(".", "_").replace(",", ".") for _, line in batch]
+        """All numbers by numpy's parser, the fastest; None where a row needs a closer look."""
         mark = self.layout.delimiter
-        try:
+        if self.label is not None or self.unended or self.layout.decimal == ",":
+            return None
+        with suppress(ValueError):
+            lines = [line for _, line in batch]
             table = np.loadtxt(lines, delimiter=None if mark == " " else mark, comments=None, ndmin=2)
-        except ValueError:
-            self.slow += 1
-            return None
-        if table.shape[1] != self.width:
-            return None
-        self.seen += len(table)
-        return table[:, self.wanted]
+            if table.shape[1] == self.width:
+                self.seen += len(table)
+                return table[:, self.wanted]
+        return None
 
     def _flat(self, rows: list[tuple[int, list[str]]]) -> Floats | None:
         """The numbers where all cells are such, or missing as most programs write it; None otherwise."""
         flat = [_BLANK.get(cells[i], cells[i]) for _, cells in rows for i in self.wanted]
-        text = "".join(flat)
-        if "_" in text or not text.isascii() or not self.point or self.unended:
-            return None  # float would take 1_000, and digits of all scripts
-        try:
-            return np.fromiter(map(float, flat), np.float64, len(flat)).reshape(len(rows), len(self.wanted))
-        except ValueError:
-            return None
+        text, comma = "".join(flat), self.layout.decimal == ","
+        if "_" in text or not text.isascii() or self.unended or (comma and "." in text):
+            return None  # float takes 1_000, and digits of all scripts; a point may stand before thousands
+        with suppress(ValueError):
+            flat = [cell.replace(",", ".") for cell in flat] if comma else flat
+            return np.fromiter(map(float, flat), np.float64, len(flat))
+        return None
 
-    def _fits(self, row: int, line: str, cells: list[str]) -> bool:
+    def _fits(self, row: int, cells: list[str], line: str) -> bool:
         """Whether a row has the table's number of cells, or a delimiter more; others are comments, or left out."""
-        self.seen += 1
+        comment = line.startswith(("#", "%")) and len(cells) != self.width
+        self.seen += not comment
         if len(cells) == self.width or (len(cells) == self.width + 1 and not cells[-1].strip()):
             return True
-        if line.startswith(("#", "%")):
-            self.seen -= 1
-        else:
-            what = f": expected {self.width} cells as the others have; came {len(cells)}"
-            self.leave_out(row, self._error(row, what))
+        if not comment:
+            self._leave(row, f": expected {self.width} cells as the others have; came {len(cells)}")
         return False
 
     def _episodes(self, rows: list[list[str]]) -> npt.NDArray[np.int64] | None:
@@ -167,38 +154,37 @@ class Delimited(Text):
         numbers = []
         for cells in rows:
             name = self.named(cells[self.label])
-            if name != self.said:
+            if name != self.said or not self.episode:
                 self.episode, self.said = self.episode + 1, name
                 self.names |= {self.episode: name} if name else {}
             numbers.append(self.episode)
         return np.array(numbers, np.int64)
 
-    def _values(self, row: int, cells: list[str]) -> list[float]:
-        """The numbers of a row, its time last; raises RecordingError for text in their place."""
+    def _values(self, row: int, cells: list[str]) -> list[float | None] | None:
+        """The numbers of a row, its time last; None where there is text in their place."""
         if row == self.unended and self._is_half(cells[self.width - 1]):
-            raise self._error(row, ": it has no end")
+            return self._leave(row, ": it has no end")
         found = [number(cells[i], self.layout.decimal) for i in self.chosen]
         if self.time is not None:
             found.append(moment(cells[self.time], self.layout.decimal))
         if None not in found:
-            return found  # type: ignore[return-value]
-        place = [*self.chosen, self.time or 0][found.index(None)]
-        hint, argument = "", ""
+            return found
+        place, hint, argument = self.wanted[found.index(None)], "", ""
         if self.request.field is None and self.numbers and place not in (*self.numbers, self.time):
-            first, last = self.numbers[0], self.numbers[-1]
             names = [self.columns[i] for i in self.numbers]
-            field = f"{names[0]}:{names[-1]}" if last - first + 1 == len(names) > 1 else ",".join(names)
+            beside = self.numbers[-1] - self.numbers[0] + 1 == len(names) > 1
+            field = f"{names[0]}:{names[-1]}" if beside else ",".join(names)
             hint = f". Name the columns with numbers by field={field!r:.200}, or the column of labels by labels="
             argument = "field labels"
         what = f"expected a number; came {cells[place].strip()!r:.60}{hint}"
-        raise self._error(row, f", column {place + 1} ({self.columns[place]}): {what}", argument or None)
+        return self._leave(row, f", column {place + 1} ({self.columns[place]}): {what}", argument or None)
 
     def _is_half(self, cell: str) -> bool:
         """Whether the last cell of a line without an end is cut: empty, a sign, or of fewer decimals than others."""
         return cell.strip() in ("", "-", "+") or len(cell.strip().partition(self.layout.decimal)[2]) < self.tail
 
-    def _error(self, row: int, what: str, argument: str | None = None) -> RecordingError:
-        return RecordingError(f"{self.address}, row {row}{what}", argument=argument)
+    def _leave(self, row: int, what: str, argument: str | None = None) -> None:
+        self.leave_out(row, RecordingError(f"{self.address}, row {row}{what}", argument=argument))
 
     def _head(self) -> list[tuple[int, str]]:
         """The first lines, a name of several lines in quotation marks as one."""
@@ -275,7 +261,6 @@ class Delimited(Text):
         self.numbers = [i for i in rest if numeric[i]]
         self.chosen = self._chosen(rest)
         self.wanted = self.chosen if self.time is None else [*self.chosen, self.time]
-        self.slow = 0  # blocks that numpy's parser refused
 
     def _heads(self, cells: list[str], numeric: list[bool]) -> bool:
         """Whether a row stands above the numbers: it has text in their place, in as many cells as it has numbers."""

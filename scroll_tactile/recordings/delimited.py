@@ -163,7 +163,8 @@ class Delimited(Text):
     def _values(self, row: int, cells: list[str]) -> list[float | None] | None:
         """The numbers of a row, its time last; None where there is text in their place."""
         if row == self.unended and self._is_half(cells[self.width - 1]):
-            return self._leave(row, ": it has no end")
+            self._leave(row, ": it has no end")
+            return None
         found = [number(cells[i], self.layout.decimal) for i in self.chosen]
         if self.time is not None:
             found.append(moment(cells[self.time], self.layout.decimal))
@@ -177,7 +178,8 @@ class Delimited(Text):
             hint = f". Name the columns with numbers by field={field!r:.200}, or the column of labels by labels="
             argument = "field labels"
         what = f"expected a number; came {cells[place].strip()!r:.60}{hint}"
-        return self._leave(row, f", column {place + 1} ({self.columns[place]}): {what}", argument or None)
+        self._leave(row, f", column {place + 1} ({self.columns[place]}): {what}", argument or None)
+        return None
 
     def _is_half(self, cell: str) -> bool:
         """Whether the last cell of a line without an end is cut: empty, a sign, or of fewer decimals than others."""

@@ -130,6 +130,7 @@ class GrowingTouch:
     encoded: list[Encoded] = field(default_factory=list)
     prediction: Prediction | None = None
     decided: bool = False
+    likely: bool = False
     estimates: dict[str, Estimate] = field(default_factory=dict)
     stage: int | None = None
     settled: bool = False
@@ -167,7 +168,9 @@ class GrowingTouch:
         self.encoded = self.encoded or [self._encoded(each, WindowCache()) for each in self.earlier]
         current = self._encoded(stream, self.cache)
         self.prediction = self.predictor.answer_of(self.model, self.candidates, [*self.encoded, current])
-        self.decided |= self.rule.decided(self.prediction, current.steps, several=bool(self.earlier))
+        reached = self.prediction, current.steps
+        self.decided |= self.rule.decided(*reached, several=bool(self.earlier))
+        self.likely = self.rule.likely(*reached, several=bool(self.earlier))
         self._estimate(current, self.prediction)
         return self.prediction
 
@@ -485,6 +488,7 @@ class LiveSession:
             stream=stream,
             prediction=prediction,
             decided=touch.decided,
+            likely=touch.likely,
             at=touch.at,
             end=end,
             earlier=touch.earlier,
@@ -514,6 +518,7 @@ class LiveSession:
                 seconds=seconds,
                 prediction=touch.prediction,
                 decided=touch.decided,
+                likely=touch.likely,
                 ended=bool(ended),
                 touches=ended,
                 estimates=touch.estimates,
@@ -526,6 +531,7 @@ class LiveSession:
             seconds=last.stream.seconds,
             prediction=last.prediction,
             decided=last.decided,
+            likely=last.likely,
             ended=True,
             touches=ended,
             estimates=last.estimates,

@@ -45,7 +45,7 @@ from scroll_tactile.results import (
     Receipt,
 )
 from scroll_tactile.sensors import Sensor
-from scroll_tactile.settings import Settings, names_of, require_name, require_source, require_text
+from scroll_tactile.settings import Settings, names_of, require_name, require_source
 from scroll_tactile.signals.correction import corrected_stream
 from scroll_tactile.signals.ranges import range_problem
 from scroll_tactile.signals.stream import Stream, validate
@@ -337,9 +337,8 @@ class TactileLearner:
         """
         if (material is None) == (source is None):
             raise InputError("say what is to be forgotten: a material, or a source")
-        if material is not None:
-            require_text(material)
-        return self._ledger.forget(material, None if source is None else require_source(source))
+        name = None if material is None else require_name(material)
+        return self._ledger.forget(name, None if source is None else require_source(source))
 
     def describe(
         self, material: str, constituents: Mapping[str, float | bool | tuple[float, str] | None] | None

@@ -23,17 +23,15 @@ from scroll_tactile_store import CompactedError, Head, ReadOnlyError, Record, St
 from scroll_tactile.errors import AnnotationError, DescriptionError, FineTuneError, InputError
 from scroll_tactile.health.channel_numbers import MOST_CHANNELS, channel_numbers, to_text
 from scroll_tactile.health.watch import WatchedRows, WatchRules
-from scroll_tactile.memory import touch_rows as kinds
-from scroll_tactile.memory.axes import axis_memory
 from scroll_tactile.memory.descriptions import Description, require_units
 from scroll_tactile.memory.gate import MemoryStore
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import (
     Changed,
     Codes,
+    Kind,
     annotated,
     annotation_of,
-    declaration,
     pack_codes,
     pack_readings,
     require_row,
@@ -109,7 +107,7 @@ class Ledger:
         """What was learned by the labels on an axis, in place of materials; of the axis "" the memory itself."""
         memory = self.memory
         if axis and (axis not in self._axes or self._axes[axis][0] != self.version):
-            self._axes[axis] = self.version, axis_memory(memory, axis)
+            self._axes[axis] = self.version, memory.of_axis(axis)
         return self._axes[axis][1] if axis else memory
 
     def read(self, what: Callable[[Memory, AnyStore], Answer]) -> Answer:
@@ -257,12 +255,12 @@ class Ledger:
                 kept = self._bare or memory.exemplars is not None or memory.kept is not None
                 attributes: dict[str, Any] = {"columns": columns} | annotated(annotation)
                 attributes |= {"nbytes": stream.readings.nbytes} if kept else {}
-                attributes |= {kinds.SOURCE: source} if source else {}
+                attributes |= {"source": source} if source else {}
                 if (numbers := channel_numbers(stream)) is not None:
-                    attributes[kinds.CHANNELS] = to_text(numbers)
+                    attributes["channels"] = to_text(numbers)
                 arrays = (pack_readings(stream.readings) if kept else {}) | ({} if self._bare else pack_codes(codes))
                 about: Any = {"attributes": attributes, "arrays": arrays, "applied": {"codes": codes}}
-                row = self.append(kinds.OBSERVE, material, stream.key, **about)
+                row = self.append(Kind.OBSERVE, material, stream.key, **about)
             return Receipt(
                 sequence=row if known is None else known,
                 material=material,
@@ -292,7 +290,7 @@ class Ledger:
             if repr(memory.descriptions.get(material)) == repr(constituents):  # 1.0 == True, but means another thing
                 return
             require_units(memory.descriptions, material, constituents or {})
-            self.append(kinds.DESCRIBE, material, attributes={"constituents": constituents})
+            self.append(Kind.DESCRIBE, material, attributes={"constituents": constituents})
             self._changed(())
 
     def declare(self, quantity: Quantity) -> None:
@@ -300,7 +298,7 @@ class Ledger:
         with self.lock:
             self.require_open()
             if require_declarable(self.memory.quantities, quantity):
-                self.append(kinds.DECLARE, quantity.name, attributes=declaration(quantity))
+                self.append(Kind.DECLARE, quantity.name, attributes=quantity.model_dump(exclude={"name"}))
 
     def sense(self, material: str, stream: Stream) -> None:
         """As `TactileLearner.sense`; material "" for the sensor at rest."""
@@ -310,20 +308,20 @@ class Ledger:
                 f"the health of a sensor is told from its channels, 1 to {MOST_CHANNELS}, and three readings or more; "
                 f"came {len(stream)} readings of {stream.sensor.name!r}"
             )
-        self.append(kinds.SENSE, material, attributes={"columns": len(stream), kinds.CHANNELS: to_text(numbers)})
+        self.append(Kind.SENSE, material, attributes={"columns": len(stream), "channels": to_text(numbers)})
 
     def adapt(self, correction: Correction) -> int:
         """Read touches through a correction from now on; durable on return, in a batch at its end. Returns its row."""
         text = correction.to_text()
         Correction.from_text(text, self._empty.recipe.sensor)  # what replay would refuse must not come into the journal
-        return self.append(kinds.ADAPT, "", attributes={kinds.CORRECTION: text})
+        return self.append(Kind.ADAPT, "", attributes={"correction": text})
 
     def retract(self, receipt: Receipt | Adaptation | int) -> None:
         """As `TactileLearner.retract`."""
         with self.lock:
             store = self.require_open()
             if (adaptation := adaptation_of(self.memory, receipt)) is not None:
-                self.append(kinds.ADAPT, "", attributes={kinds.RETRACTS: adaptation})  # one before it counts again
+                self.append(Kind.ADAPT, "", attributes={"retracts": adaptation})  # one before it counts again
             else:
                 self._retract([observation_of(store, self.memory, receipt)], "")
 
@@ -338,7 +336,7 @@ class Ledger:
     def _retract(self, records: Sequence[Record], material: str) -> None:
         gone = {record.sequence: record for record in records}
         how: Any = {"chosen": chosen_without(self.memory, self.store, gone), "applied": {"gone": gone}}
-        self.append(kinds.RETRACT, material, attributes={"sequences": spans(gone)}, **how)
+        self.append(Kind.RETRACT, material, attributes={"sequences": spans(gone)}, **how)
 
     def relabel(self, receipt: Receipt | int, material: str) -> int:
         """As `TactileLearner.relabel`."""
@@ -349,7 +347,7 @@ class Ledger:
             known = self._known(material, record.key, annotation_of(record.attributes))
             self._retract([record], "")
             kept: Any = {"attributes": record.attributes, "arrays": record.arrays, "time": record.time}
-            return self.append(kinds.OBSERVE, material, record.key, **kept) if known is None else known
+            return self.append(Kind.OBSERVE, material, record.key, **kept) if known is None else known
 
     def merge(
         self, other: str | os.PathLike[str] | RamStore, progress: Callable[[str, int, int], object], **how: Any
@@ -367,7 +365,7 @@ class Ledger:
                         self.declare(quantity)
                     for material, constituents in merge.descriptions.items():
                         require_units({**self.memory.descriptions, **merge.descriptions}, material, constituents)
-                        self.append(kinds.DESCRIBE, material, attributes={"constituents": constituents})
+                        self.append(Kind.DESCRIBE, material, attributes={"constituents": constituents})
                 except (AnnotationError, DescriptionError) as error:
                     raise merge.refusing(error) from None
                 for done, row in enumerate(merge.rows(), start=1):
@@ -393,7 +391,7 @@ class Ledger:
                 self._whole = False
                 store.compact(arrays, last_sequence=last_sequence, attributes=attributes, newest=newest)
                 memory.saved, self._saved_weighings = memory.sequence, {}  # it has none
-                memory.note_compaction(last_sequence)
+                memory.compacted = last_sequence
                 self._whole = True
                 give_back_scratch()
             return Compacted(memory.compacted, before, sum(store.size().values()))

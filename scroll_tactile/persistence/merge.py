@@ -14,11 +14,10 @@ from scroll_tactile_store.exceptions import reported
 from scroll_tactile_store.files import same_folder
 
 from scroll_tactile.errors import MismatchError, ObservationError
-from scroll_tactile.memory import touch_rows as kinds
 from scroll_tactile.memory.descriptions import Description
-from scroll_tactile.memory.identity import Identity
+from scroll_tactile.memory.identity import Identity, differences
 from scroll_tactile.memory.state import Memory
-from scroll_tactile.memory.touch_rows import active_rows, annotation_of, declaration
+from scroll_tactile.memory.touch_rows import Kind, active_rows, annotation_of
 from scroll_tactile.persistence.observations import TouchRows, refusal, rows_with
 from scroll_tactile.persistence.ram_store import AnyStore
 from scroll_tactile.persistence.replaying import exemplar_candidates, load, refill
@@ -27,7 +26,7 @@ from scroll_tactile.statistics.annotations import MOST_AXES
 __all__ = ["Choice", "Merge", "pack_memory"]
 
 # Attributes of an observation that stay where it comes in without its features.
-MEMBERS = kinds.SOURCE, kinds.VALUES, kinds.LABELS
+MEMBERS = "source", "values", "labels"
 Choice = Literal["same", "ours", "theirs"]
 """Whose description of a material is kept where two memories describe it; "same": they must agree."""
 
@@ -64,7 +63,7 @@ class Merge:
         self._one_name, self._clipped = one_name, clipped
         self._compacted, self._compaction, heads = theirs.compacted, theirs.compaction(), list(theirs.heads())
         incoming = active_rows(heads)
-        whole = bool(self._compacted) or any(head.kind == kinds.MERGE for head in heads)
+        whole = bool(self._compacted) or any(head.kind == Kind.MERGE for head in heads)
         self._require_same_making(whole)
         said = load(memory, theirs)
         self.quantities = list(said.quantities.values())
@@ -75,11 +74,11 @@ class Merge:
         self._left_out = {*known, *(head.sequence for head, _ in self.refused)}
         self._require_able_to_leave_out([head for head in incoming if head.sequence in self._left_out])
         # A merge before the compaction checkpoint is a part of it.
-        within = {head.sequence for head in incoming if head.kind == kinds.MERGE and head.sequence <= self._compacted}
+        within = {head.sequence for head in incoming if head.kind == Kind.MERGE and head.sequence <= self._compacted}
         self._rows = [head for head in incoming if head.sequence not in self._left_out | within]
-        self.added = sum(head.kind != kinds.MERGE for head in self._rows)
+        self.added = sum(head.kind != Kind.MERGE for head in self._rows)
         self.total = (self._compaction is not None) + len(self._rows)
-        bare = any(head.kind == kinds.OBSERVE and "nbytes" not in head.attributes for head in self._rows)
+        bare = any(head.kind == Kind.OBSERVE and "nbytes" not in head.attributes for head in self._rows)
         if bare and memory.exemplars is not None:
             raise MismatchError(
                 f"{theirs.path} kept no readings of what it observed (exemplars=0), of which {ours.path} keeps "
@@ -111,17 +110,17 @@ class Merge:
             left_out = ("tuned", "corrections", "descriptions")  # these stay there, and descriptions come as rows
             attributes = {name: value for name, value in compaction.attributes.items() if not name.startswith(left_out)}
             arrays = {name: array for name, array in compaction.arrays.items() if not name.startswith("tuned")}
-            row: dict[str, Any] = {"kind": kinds.MERGE, "label": "", "attributes": attributes, "arrays": arrays}
+            row: dict[str, Any] = {"kind": Kind.MERGE, "label": "", "attributes": attributes, "arrays": arrays}
             yield row | {"time": self._rows[0].time if self._rows else None}
         for head in self._rows:
-            named = {} if self._source is None or head.kind == kinds.MERGE else {kinds.SOURCE: self._source}
+            named = {} if self._source is None or head.kind == Kind.MERGE else {"source": self._source}
             attributes = named | dict(head.attributes)
             row = {"kind": head.kind, "label": head.label, "key": head.key, "time": head.time}
             if head.sequence > self._compacted:
                 yield row | {"attributes": attributes, "arrays": dict(self._theirs.record(head.sequence).arrays)}
             else:
                 kept = {name: value for name, value in attributes.items() if name in MEMBERS}
-                yield row | {"kind": kinds.MEMBER, "attributes": kept}
+                yield row | {"kind": Kind.MEMBER, "attributes": kept}
 
     def refusing(self, why: object) -> MismatchError:
         """The error that says why the other memory cannot be merged."""
@@ -134,11 +133,9 @@ class Merge:
             raise MismatchError(f"{ours} cannot be merged into itself: it has all of it already")
         mine, other = Identity.read(self._ours), Identity.read(self._theirs)
         for part in ("sensor", "embedding", "reading", "views", "grid"):
-            own, incoming = (str(getattr(identity, part)) for identity in (mine, other))
-            if own != incoming:
+            if differing := differences(part, getattr(other, part), getattr(mine, part)):
                 raise self.refusing(
-                    f"their {part.removesuffix('s')}s differ. Here it is {own}, there {incoming}. Merge memories of "
-                    "one sensor and one embedding"
+                    f"their {part.removesuffix('s')}s differ: {differing}. Merge those of one sensor and one embedding"
                 )
         for what, kept in (("exemplars", self._memory.exemplars), ("kept_touches", self._memory.kept)):
             if whole and kept is not None and getattr(mine, what) != getattr(other, what):
@@ -153,7 +150,7 @@ class Merge:
         came: dict[bytes, TouchRows] = {}
         known: set[int] = set()
         refused: list[tuple[Head, str]] = []
-        for head in (head for head in incoming if head.kind != kinds.MERGE):
+        for head in (head for head in incoming if head.kind != Kind.MERGE):
             ours, theirs = rows_with(self._ours, self._memory, head.key), came.setdefault(head.key, {})
             there, annotation = ours.get(head.label) or theirs.get(head.label), annotation_of(head.attributes)
             names = list(ours or theirs) if self._one_name else []
@@ -168,12 +165,12 @@ class Merge:
                 refused.append((head, why))
             elif there is None:
                 theirs[head.label] = head.sequence, annotation
-            elif head.label in ours or (head.kind == kinds.OBSERVE and head.sequence > self._compacted):
+            elif head.label in ours or (head.kind == Kind.OBSERVE and head.sequence > self._compacted):
                 known.add(head.sequence)
         return known, refused
 
     def _require_able_to_leave_out(self, rows: Sequence[Head]) -> None:
-        fixed = [head for head in rows if head.sequence <= self._compacted or head.kind == kinds.MEMBER]
+        fixed = [head for head in rows if head.sequence <= self._compacted or head.kind == Kind.MEMBER]
         if fixed:
             both = "both have it; merge the other way round, if ours was not compacted"
             why = {head.sequence: why for head, why in self.refused}.get(fixed[0].sequence, both)
@@ -202,16 +199,16 @@ def pack_memory(
 ) -> None:
     """Write all that a memory learned as a packed memory; the arguments are those of `TactileLearner.pack`."""
     found = active_rows(store.heads())
-    heads = [head for head in found if head.kind != kinds.MERGE]
+    heads = [head for head in found if head.kind != Kind.MERGE]
     with_arrays = rows and readings and not memory.compacted and len(heads) == len(found)
     identity: dict[str, Any] = Identity.read(store).to_json()
     packed = copy(memory)
-    packed.tuned, packed.tuned_last_sequence, packed.retracted, packed.excluded = None, 0, set(), set()
+    packed.tuned, packed.tuned_last_sequence, packed.retracted = None, 0, set()
     packed.corrections = {}  # they are of this unit; what was read through them is in the touches
     packed.exemplars = memory.empty_like().exemplars  # their rows have other numbers there
     left_out: tuple[str, ...] = ()
     if not readings:
-        left_out = "nbytes", kinds.CHANNELS
+        left_out = "nbytes", "channels"
         identity |= {"exemplars": 0, "kept_touches": 0}
         packed.kept = packed.exemplars = None
     with reported(path, "packing a memory"):
@@ -224,15 +221,15 @@ def pack_memory(
         with Store.open(folder, identity=identity) as into:
             with into.batch():
                 for quantity in memory.quantities.values():
-                    into.append(kinds.DECLARE, quantity.name, b"", attributes=declaration(quantity))
+                    into.append(Kind.DECLARE, quantity.name, b"", attributes=quantity.model_dump(exclude={"name"}))
                 for head in heads:
-                    attributes: dict[str, Any] = {} if source is None else {kinds.SOURCE: source}
+                    attributes: dict[str, Any] = {} if source is None else {"source": source}
                     attributes |= {name: value for name, value in head.attributes.items() if name not in left_out}
                     row: Any = {"attributes": attributes, "time": head.time}
                     row["arrays"] = store.record(head.sequence).arrays if with_arrays else None
                     packed.add_exemplar(into.append(head.kind, head.label, head.key, **row))
                 for material, constituents in memory.descriptions.items():
-                    into.append(kinds.DESCRIBE, material, b"", attributes={"constituents": constituents})
+                    into.append(Kind.DESCRIBE, material, b"", attributes={"constituents": constituents})
             candidates = exemplar_candidates(memory, store) if readings and not with_arrays else []
             arrays, told = packed.to_arrays(*(() if with_arrays else (into.last, candidates)))
             keep = into.commit if with_arrays else into.compact

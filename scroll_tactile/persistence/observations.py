@@ -13,9 +13,8 @@ from typing import cast
 from scroll_tactile_store import Head, Record
 
 from scroll_tactile.errors import InputError, ObservationError, UnknownMaterialError
-from scroll_tactile.memory import touch_rows as kinds
 from scroll_tactile.memory.state import MOST_CORRECTIONS, Memory
-from scroll_tactile.memory.touch_rows import active_rows, annotation_of, declared_by, retracted_by
+from scroll_tactile.memory.touch_rows import Kind, active_rows, annotation_of, declared_by, retracted_by
 from scroll_tactile.persistence.ram_store import AnyStore
 from scroll_tactile.results import Adaptation, Observation, Receipt
 from scroll_tactile.signals.ranges import CURE
@@ -41,7 +40,7 @@ def rows_with(store: AnyStore, memory: Memory, key: bytes) -> TouchRows:
     """The rows of observations that count and have readings with this hash; of each name the first."""
     found: TouchRows = {}
     for head in takewhile(lambda head: head.sequence <= memory.sequence, store.with_key(key)):
-        if head.kind in (kinds.OBSERVE, kinds.MEMBER) and not memory.is_gone(head.sequence):
+        if head.kind in (Kind.OBSERVE, Kind.MEMBER) and head.sequence not in memory.retracted:
             found.setdefault(head.label, (head.sequence, annotation_of(head.attributes)))
     return found
 
@@ -77,7 +76,7 @@ def observation_of(store: AnyStore, memory: Memory, receipt: Receipt | Adaptatio
             "and their features given up"
         )
     record = store.record(sequence)
-    if record.kind != kinds.OBSERVE:
+    if record.kind != Kind.OBSERVE:
         raise ObservationError(
             f"row {sequence} of {store.path} is no observation, and no adaptation that counts, but of kind "
             f"{record.kind!r}"
@@ -119,13 +118,13 @@ def to_forget(store: AnyStore, memory: Memory, material: str | None, source: str
     mine = [
         head
         for head in active_rows(store.heads())
-        if head.kind != kinds.MERGE and (is_from(_source(head), source) if material is None else head.label == material)
+        if head.kind != Kind.MERGE and (is_from(_source(head), source) if material is None else head.label == material)
     ]
     if not mine:
         raise ObservationError(
             f"no observation of {store.path} comes from {source!r}; observations() lists their sources"
         )
-    if gone := [head for head in mine if head.kind == kinds.MEMBER or head.sequence <= memory.compacted]:
+    if gone := [head for head in mine if head.kind == Kind.MEMBER or head.sequence <= memory.compacted]:
         what = f"what comes from {source!r}" if material is None else f"{material!r}"
         raise ObservationError(
             f"{what} cannot be forgotten: {len(gone)} of its {len(mine)} observations in {store.path} were compacted, "
@@ -136,7 +135,7 @@ def to_forget(store: AnyStore, memory: Memory, material: str | None, source: str
 
 
 def _source(head: Head) -> str | None:
-    return cast("str | None", head.attributes.get(kinds.SOURCE))
+    return cast("str | None", head.attributes.get("source"))
 
 
 def is_from(recorded: str | None, source: str | None) -> bool:
@@ -151,11 +150,11 @@ def observations(store: AnyStore) -> list[Observation]:
     """All observations of a journal, in order, and the state of each."""
     heads, compacted = list(store.heads()), store.compacted
     retracted = retracted_by(heads)
-    quantities = {head.label: declared_by(head) for head in heads if head.kind == kinds.DECLARE}
+    quantities = {head.label: declared_by(head) for head in heads if head.kind == Kind.DECLARE}
 
     def observation(head: Head) -> Observation:
         annotation = annotation_of(head.attributes)
-        gone = head.sequence <= compacted or head.kind == kinds.MEMBER
+        gone = head.sequence <= compacted or head.kind == Kind.MEMBER
         return Observation(
             sequence=head.sequence,
             material=head.label,
@@ -167,7 +166,7 @@ def observations(store: AnyStore) -> list[Observation]:
             labels=dict(annotation.labels),
         )
 
-    return [observation(head) for head in heads if head.kind in (kinds.OBSERVE, kinds.MEMBER)]
+    return [observation(head) for head in heads if head.kind in (Kind.OBSERVE, Kind.MEMBER)]
 
 
 def compaction_end(store: AnyStore, memory: Memory, keep: int) -> int:
@@ -175,6 +174,8 @@ def compaction_end(store: AnyStore, memory: Memory, keep: int) -> int:
     if isinstance(keep, bool) or not isinstance(keep, int) or keep < 0:
         raise InputError(f"expected keep as a whole number of 0 or more; came {keep!r}")
     kept = [
-        head.sequence for head in store.heads(memory.compacted, kind=kinds.OBSERVE) if not memory.is_gone(head.sequence)
+        head.sequence
+        for head in store.heads(memory.compacted, kind=Kind.OBSERVE)
+        if head.sequence not in memory.retracted
     ]
     return [*kept, store.last + 1][-keep - 1] - 1 if len(kept) > keep or not keep else memory.compacted

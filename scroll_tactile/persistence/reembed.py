@@ -23,11 +23,10 @@ from scroll_tactile_store.files import is_there, sync_folder
 from scroll_tactile_store.lock import WriterLock
 
 from scroll_tactile.errors import MismatchError
-from scroll_tactile.memory import touch_rows as kinds
 from scroll_tactile.memory.gate import MemoryStore, beside, finish_interrupted
 from scroll_tactile.memory.identity import Identity
 from scroll_tactile.memory.state import Memory
-from scroll_tactile.memory.touch_rows import Codes, Readings, pack_codes, pack_readings, unpack_readings
+from scroll_tactile.memory.touch_rows import Codes, Kind, Readings, pack_codes, pack_readings, unpack_readings
 from scroll_tactile.persistence.ledger import Ledger
 from scroll_tactile.persistence.replaying import refill
 from scroll_tactile.recipe import Recipe
@@ -35,7 +34,7 @@ from scroll_tactile.recipe import Recipe
 __all__ = ["Reembedding"]
 
 ROWS_TOGETHER = 64  # rows that wait for the disk together
-LEARNED = kinds.OBSERVE, kinds.MEMBER, kinds.MERGE  # the first alone may have readings
+LEARNED = Kind.OBSERVE, Kind.MEMBER, Kind.MERGE  # the first alone may have readings
 
 
 class Reembedding:
@@ -88,7 +87,7 @@ class Reembedding:
 
     def _embedded(self, record: Record) -> dict[str, Any]:
         attributes, arrays = dict(record.attributes), dict(record.arrays)
-        if record.kind != kinds.OBSERVE:
+        if record.kind != Kind.OBSERVE:
             return {"attributes": attributes, "arrays": arrays}
         readings = cast(Readings, unpack_readings(arrays))
         steps, codes = self._encode(readings)

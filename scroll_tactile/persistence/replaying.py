@@ -11,17 +11,15 @@ from collections.abc import Mapping, Sequence
 from copy import copy
 from itertools import takewhile
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
 from scroll_tactile_store import CompactedError, DamageError, Head, Record, Store
 
-from scroll_tactile.memory import touch_rows as kinds
-from scroll_tactile.memory.descriptions import describe
 from scroll_tactile.memory.exemplars import Exemplar, rank
 from scroll_tactile.memory.state import Memory, MemoryFields
-from scroll_tactile.memory.touch_rows import Changed, Codes, declared_by, only_readings, refusing, unspanned
+from scroll_tactile.memory.touch_rows import Changed, Codes, Kind, declared_by, refusing, unpack_readings, unspanned
 from scroll_tactile.persistence.ram_store import AnyStore
 from scroll_tactile.signals.correction import Correction
 from scroll_tactile.signals.windows import Scale
@@ -68,13 +66,13 @@ def apply(
     """
     changed: list[Changed] | None = []
     _note(memory, row)
-    if row.kind == kinds.OBSERVE and summed:
+    if row.kind == Kind.OBSERVE and summed:
         memory.add_exemplar(row)
-    elif row.kind == kinds.OBSERVE:
+    elif row.kind == Kind.OBSERVE:
         changed = [memory.add(row, codes)]
-    elif row.kind == kinds.RETRACT:
+    elif row.kind == Kind.RETRACT:
         changed = _retract(memory, row, store, gone or {})
-    elif row.kind == kinds.MERGE:
+    elif row.kind == Kind.MERGE:
         _join(memory, row, store.path)
         changed = None
     memory.sequence = row.sequence
@@ -83,19 +81,22 @@ def apply(
 
 def _note(memory: Memory, row: Head) -> None:
     """Apply what a row says of quantities, descriptions and the skin, if anything."""
-    if row.kind == kinds.DECLARE:
+    if row.kind == Kind.DECLARE:
         memory.quantities.setdefault(row.label, declared_by(row))
-    elif row.kind in (kinds.DESCRIBE, kinds.RETRACT):  # a retraction, which says none, names what was forgotten
-        describe(memory.descriptions, row.label, row.attributes.get("constituents"))
-    elif row.kind == kinds.ADAPT and kinds.RETRACTS in row.attributes:
-        memory.corrections.pop(cast(int, row.attributes[kinds.RETRACTS]), None)
-    elif row.kind == kinds.ADAPT:
-        memory.correct(row.sequence, Correction.from_text(row.attributes[kinds.CORRECTION], memory.recipe.sensor))
+    elif row.kind in (Kind.DESCRIBE, Kind.RETRACT):  # a retraction, which says none, names what was forgotten
+        if constituents := row.attributes.get("constituents"):
+            memory.descriptions[row.label] = dict(cast(Any, constituents))
+        else:
+            memory.descriptions.pop(row.label, None)
+    elif row.kind == Kind.ADAPT and "retracts" in row.attributes:
+        memory.corrections.pop(cast(int, row.attributes["retracts"]), None)
+    elif row.kind == Kind.ADAPT:
+        memory.correct(row.sequence, Correction.from_text(row.attributes["correction"], memory.recipe.sensor))
 
 
 def _retract(memory: Memory, row: Record, store: AnyStore, known: Mapping[int, Record]) -> list[Changed]:
     gone = unspanned(row.attributes["sequences"])
-    if kept := [sequence for sequence in gone if sequence <= memory.compacted and sequence not in memory.excluded]:
+    if kept := [sequence for sequence in gone if sequence <= memory.compacted and sequence not in memory.retracted]:
         # A repair made the compaction checkpoint: `compact` would have left them out.
         why = "its features were lost to damage. Only a copy from before the damage can leave it out"
         for one in kept:
@@ -103,7 +104,7 @@ def _retract(memory: Memory, row: Record, store: AnyStore, known: Mapping[int, R
                 "%s: observation %d was retracted by row %d, but still counts: %s", store.path, one, row.sequence, why
             )
     later = [sequence for sequence in gone if sequence > memory.compacted]
-    with refusing(store.path, f"row {row.sequence}", row.sequence):
+    with refusing(store.path, row):
         return [memory.retract(known.get(sequence) or store.record(sequence)) for sequence in later]
 
 
@@ -160,7 +161,7 @@ def until(memory: Memory, store: AnyStore, last_sequence: int) -> Memory:
     """The memory of all observations up to a row, without retracted ones: a compaction at that row keeps it."""
     made, later = _chosen(memory, store, last_sequence), memory.empty_like()
     for head in store.heads(last_sequence):  # whoever compacts has read all
-        if head.kind in (kinds.OBSERVE, kinds.MERGE) and head.sequence not in memory.retracted:
+        if head.kind in (Kind.OBSERVE, Kind.MERGE) and head.sequence not in memory.retracted:
             apply(later, store.record(head.sequence), store)
     made.take_sums(memory, later, last_sequence)
     return made
@@ -178,9 +179,9 @@ def _chosen(memory: Memory, store: AnyStore, last_sequence: int) -> Memory:
     heads = list(takewhile(lambda head: head.sequence <= last_sequence, store.heads(memory.compacted)))
     for head in heads:
         _note(fresh, head)
-        if head.kind == kinds.MERGE:
+        if head.kind == Kind.MERGE:
             _join(fresh, store.record(head.sequence), store.path)
-    observed = [head for head in heads if head.kind == kinds.OBSERVE and head.sequence not in memory.retracted]
+    observed = [head for head in heads if head.kind == Kind.OBSERVE and head.sequence not in memory.retracted]
     fresh.choose(observed, store.record, memory)
     return fresh
 
@@ -220,9 +221,9 @@ def exemplar_candidates(memory: Memory, store: AnyStore) -> list[Exemplar]:
 def _exemplars_in(memory: Memory, store: AnyStore, sequence: int) -> list[Exemplar]:
     """The exemplars that a row of the journal holds; 0: those of the compaction checkpoint."""
     row = store.record(sequence) if sequence else store.compaction()
-    if isinstance(row, Record) and row.kind == kinds.OBSERVE:
+    if isinstance(row, Record) and row.kind == Kind.OBSERVE:
         steps, codes = memory.codes(row)
-        readings, stages = only_readings(row.arrays), memory.plan.scored_stages(steps)
+        readings, stages = cast(Any, unpack_readings(row.arrays)), memory.plan.scored_stages(steps)
         return [Exemplar.of(row.label, row.key, readings, stages, codes)]
     kept = None if row is None else MemoryFields.of(row, memory.statistics.dimension, store.path).exemplars
     return [] if kept is None else kept.exemplars()

@@ -19,9 +19,8 @@ from scroll_tactile.errors import InputError, UnknownMaterialError
 from scroll_tactile.health.channel_numbers import MOST_CHANNELS, from_text, has_numbers
 from scroll_tactile.health.skin_fit import Fitted, Reference, fitted, guess_of_lost
 from scroll_tactile.health.watch import WatchedRow, WatchedRows, WatchRules
-from scroll_tactile.memory import touch_rows as kinds
 from scroll_tactile.memory.state import Memory
-from scroll_tactile.memory.touch_rows import retracted_by
+from scroll_tactile.memory.touch_rows import Kind, retracted_by
 from scroll_tactile.persistence.ledger import Ledger
 from scroll_tactile.persistence.observations import is_from
 from scroll_tactile.persistence.ram_store import AnyStore
@@ -75,11 +74,11 @@ def _piece(ledger: Ledger, watched: WatchedRows) -> list[WatchedRow]:
             return []
 
         def row(head: Head) -> WatchedRow:
-            source = cast("str | None", head.attributes.get(kinds.SOURCE))
-            counts = head.kind in (kinds.OBSERVE, kinds.SENSE) and not memory.is_gone(head.sequence)
+            source = cast("str | None", head.attributes.get("source"))
+            counts = head.kind in (Kind.OBSERVE, Kind.SENSE) and head.sequence not in memory.retracted
             if not counts or not (rules.source is None or is_from(source, rules.source)):
                 return WatchedRow(head.sequence)
-            numbers = from_text(head.attributes.get(kinds.CHANNELS), watched.watch.channels)
+            numbers = from_text(head.attributes.get("channels"), watched.watch.channels)
             return WatchedRow(head.sequence, head.label, cast(int, head.attributes["columns"]), numbers)
 
         return [row(head) for head in islice(_heads(store, memory, rules.until, watched.last), PIECE)]
@@ -142,8 +141,8 @@ def adapt_to(
         kept = [] if memory.kept is None else [each.levels for each in memory.kept.touches() if each.key not in out]
         reference = Reference(sensor.channels)
         for head in _heads(store, memory, until):
-            counts = head.kind == kinds.OBSERVE and not memory.is_gone(head.sequence) and head.key not in own
-            numbers = from_text(head.attributes.get(kinds.CHANNELS) if counts else None, sensor.channels)
+            counts = head.kind == Kind.OBSERVE and head.sequence not in memory.retracted and head.key not in own
+            numbers = from_text(head.attributes.get("channels") if counts else None, sensor.channels)
             if numbers is not None:
                 reference.take(head.label, numbers)
         missing = [name for name in sorted(set(touches.values())) if not reference.counts.get(name)]

@@ -177,7 +177,7 @@ def samples(learner: TactileLearner) -> dict[str, Any]:
     pool = hashlib.sha256()
     for name, key, touch in memory.sample:
         pool.update(repr((name, key, touch.rows.tobytes(), touch.pairs.tobytes(), touch.annotation)).encode())
-    arrays, told = ({}, None) if memory.kept is None else encode(memory.kept.to_fields())
+    arrays, told = ({}, None) if memory.kept is None else encode(scroll_tactile.memory.state.KeptFields.of(memory.kept))
     kept = hashlib.sha256(repr(told).encode())
     for name in sorted(arrays):
         kept.update(repr((name, arrays[name].shape)).encode() + arrays[name].tobytes())

@@ -17,7 +17,7 @@ from scroll_tactile_store.store import Store
 
 from faults.planting import BUGS, Replacement, bug, nothing
 from scroll_tactile.memory.state import Memory
-from scroll_tactile.memory.touch_rows import MEMBER, MERGE, OBSERVE
+from scroll_tactile.memory.touch_rows import Kind
 from scroll_tactile.persistence import ledger, merge, replaying
 
 
@@ -161,7 +161,7 @@ def _kept_not_retracted(chosen: Any, memory: Any, given: Any, last_sequence: int
 
 @bug("a retraction is lost in a merge or in packing", merge, "active_rows")
 def _retracted_rows_too(_: Any, heads: Any) -> Any:
-    return [head for head in heads if head.kind in (OBSERVE, MERGE, MEMBER)]
+    return [head for head in heads if head.kind in (Kind.OBSERVE, Kind.MERGE, Kind.MEMBER)]
 
 
 @bug("a shared touch is counted twice", merge.Merge, "_there")

@@ -171,6 +171,8 @@ class History(RuleBasedStateMachine):
         assert repair_store(copy).kept == lost - 1
         if not self.compacted:
             self.compaction = None  # one that stands for no rows
+        elif self.current[0] == self.compacted:
+            self.compaction = self.current  # of two that stand for the same rows a repair names the newer
         self.rows = self.rows[: lost - 1]
         self.go_on(copy)
 

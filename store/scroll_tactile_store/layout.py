@@ -99,8 +99,8 @@ class Current:
             if known["format"] != FORMAT_VERSION:
                 raise VersionError(other_format(path, known["format"]))
             number, identity = known["log"]
-            named = [NamedCheckpoint.read(known[name]) for name in ("newest", "compaction")]
-            return cls(_count(number), bytes.fromhex(identity), *named, last=_count(known.get("last", 0)))
+            newest, compaction = NamedCheckpoint.read(known["newest"]), NamedCheckpoint.read(known["compaction"])
+            return cls(_count(number), bytes.fromhex(identity), newest, compaction, _count(known.get("last", 0)))
         except (KeyError, TypeError, ValueError) as error:
             raise _not_as_written(path, error) from error
 

@@ -114,11 +114,11 @@ def _repair(survey: Survey) -> Repair:
     identity = create_log(path, to_json("identity", survey.identity).encode(), _rows(survey, kept, compacted))
     with Log(path) as log:
         rows = read_back(log)
-        named = [
+        start, stand_in = (
             None if each is None else replace(each, place=rows.place(log, each.last_sequence))
             for each in (start, stand_in)
-        ]
-    current = Current(number, identity, *named, kept)
+        )
+    current = Current(number, identity, start, stand_in, kept)
     damaged = [*survey.spoilt, *(log_path(folder, other) for other in numbers(folder, LOG) if other != number)]
     aside = {each: _put_aside(each) for each in damaged if each.exists()}
     write_current(folder, current)

@@ -37,6 +37,7 @@ logger = logging.getLogger(__name__)
 # behind the damage.
 Damaged = Callable[[DamageError, list[Frame]], object]
 
+NEWER = f"this release reads format {VERSION}: upgrade it; nothing was changed"
 BEGIN = LogPlace(0, 0, 0, NO_CHECKSUM)
 USUAL = 2**13  # bytes of a frame, which are read at once
 PART = 2**18  # bytes of the file that are looked through at once
@@ -86,29 +87,21 @@ class Log:
     def _read_header(self, identity: bytes | None) -> None:
         self.place = BEGIN
         try:
-            frame = self._first_frame()
-            self.identity, self._mark = frame.identity, MARK + frame.identity
+            frame = read_frame(self.at(0, FRAME_BYTES), 0)
+            if frame is not None and frame.version > VERSION:
+                raise VersionError(f"{self.path} is written in format {frame.version}; {NEWER}")
+            if frame is None or frame[3:6] != (0, 0, HEADER):
+                raise self._damage("does not begin as a log, or its first frame is not as it was written", BEGIN)
+            if identity not in (None, frame.identity):
+                raise self._damage("is the log of another store, or of another time", BEGIN)
+            self.identity = frame.identity
             self.header = self._payload(frame, b"")
             self.place = LogPlace.behind(frame)
         except DamageError as damage:
             if identity is None:
                 raise
-            self.header_damage = damage
-            self.identity, self._mark = identity, MARK + identity
-        self.first = self.place
-
-    def _first_frame(self) -> Frame:
-        frame = read_frame(self.at(0, FRAME_BYTES), 0)
-        if frame is None:
-            raise self._damage("does not begin as a log, or its first frame is not as it was written", BEGIN)
-        if frame.version > VERSION:
-            raise VersionError(
-                f"{self.path} is written in format {frame.version}; this release reads format {VERSION}: upgrade it; "
-                "nothing was changed"
-            )
-        if frame.version != VERSION or frame[3:6] != (0, 0, HEADER) or frame.previous != NO_CHECKSUM:
-            raise self._damage("does not begin with the first frame of a log", BEGIN)
-        return frame
+            self.header_damage, self.identity = damage, identity
+        self.first, self._mark = self.place, MARK + self.identity
 
     def _damage(self, what: str, at: LogPlace | Frame) -> DamageError:
         return DamageError(f"{self.path} {what} (byte {at.offset})", path=self.path, offset=at.offset, frame=at.number)
@@ -150,7 +143,10 @@ class Log:
         if self.place == BEGIN:
             self._resume(BEGIN)
         while True:
-            frames, torn, proof = self._next_batch(durable)
+            for _ in range(ATTEMPTS):
+                frames, torn = self._batch()
+                if torn is None or (proof := self._proof(torn, durable)) is None:
+                    break
             if torn is None:
                 self.place = LogPlace.behind(frames.pop())
                 if frames:
@@ -164,17 +160,6 @@ class Log:
                 damaged(self._damage(f"{what}. What is before it verifies and can be kept", torn), frames)
                 if not self._resume(torn):
                     return
-
-    def _next_batch(self, durable: LogPlace | None) -> tuple[list[Frame], LogPlace | None, str | None]:
-        """Return the next batch; or what verifies of it, the place where it ends, and what proves that it was whole."""
-        for attempt in range(ATTEMPTS):
-            frames, torn = self._batch()
-            if torn is None:
-                return frames, None, None
-            proof = self._proof(torn, durable) if attempt else None
-            if attempt and proof is None:
-                break
-        return frames, torn, proof
 
     def _batch(self) -> tuple[list[Frame], LogPlace | None]:
         """Return the frames from the place on that verify, up to a commit frame, or the place where one does not."""
@@ -197,7 +182,7 @@ class Log:
         """Return the payload of a frame, verified; begin: what was read of it, and maybe of what is behind it."""
         payload = begin[: frame.size]
         if len(payload) < frame.size:
-            payload += self.at(frame.payload_offset + len(payload), frame.size - len(payload))
+            payload += self.at(frame.offset + FRAME_BYTES + len(payload), frame.size - len(payload))
         if len(payload) != frame.size or payload_digest(payload) != frame.digest:
             raise self._damage(f"is damaged: the payload of frame {frame.number} is not as it was written", frame)
         return payload

@@ -167,32 +167,26 @@ class Store:
         for _ in range(ATTEMPTS):
             current = read_current(self._folder / CURRENT_FILE)
             path = log_path(self._folder, current.log)
-            try:
-                log = Log(path, write=self.mode == "write")
+            with suppress(FileNotFoundError):  # a writer removes a log after another has taken its place
+                log = Log(path, write=self.mode == "write", identity=current.log_identity)
                 break
-            except FileNotFoundError as error:
-                # A writer removes a log after another has taken its place.
-                if read_current(self._folder / CURRENT_FILE) == current:
-                    what = f"{path}, which {CURRENT_FILE} names, is not there: put it back from a copy, or repair the"
-                    raise DamageError(
-                        f"{what} store (repair_store), which resumes from what verifies", path=path
-                    ) from error
         else:
-            raise StoreError(f"{self.path} is compacted again and again: open it later")
+            what = f"{path}, which {CURRENT_FILE} names, is not there: put it back from a copy, or repair the store"
+            raise DamageError(f"{what} (repair_store), which resumes from what verifies", path=path)
         try:
-            rows = self._read(current, log)
-            self.identity: Mapping[str, JSON] = from_json(log.header.decode())
-        except BaseException as error:
+            return current, log, self._read(current, log)
+        except BaseException:
             log.close()
-            if isinstance(error, ValueError):
-                what = f"the identity in {log.path} was never written so: {error}"
-                raise DamageError(what, path=log.path) from error
             raise
-        return current, log, rows
 
     def _read(self, current: Current, log: Log) -> Rows:
-        if log.identity != current.log_identity:
-            raise DamageError(f"{log.path} is the log of another store, or of another time", path=log.path)
+        if log.header_damage is not None:
+            raise DamageError(f"{log.header_damage}: repair the store (repair_store)", path=log.path, offset=0, frame=0)
+        try:
+            self.identity: Mapping[str, JSON] = from_json(log.header.decode())
+        except ValueError as error:
+            what = f"the identity in {log.path} was never written so: {error}"
+            raise DamageError(what, path=log.path) from error
         rows = Rows()
         if (named := current.newest) is not None:
             if not log.has_place(named.place):

@@ -288,7 +288,7 @@ def test_a_frame_is_read_by_its_place_and_verified(copy):
             with pytest.raises(DamageError):
                 log.read(offset, length)
         with copy.open("r+b") as file:
-            file.seek(frames[2].payload_offset + 3)
+            file.seek(frames[2].offset + FRAME_BYTES + 3)
             file.write(b"?")
         with pytest.raises(DamageError, match=f"payload of frame {frames[2].number}") as raised:
             log.read(frames[2].offset, frames[2].size)

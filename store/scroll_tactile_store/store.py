@@ -20,7 +20,6 @@ from scroll_tactile_store.archive import unpacked
 from scroll_tactile_store.backup import back_up
 from scroll_tactile_store.checkpoint_files import (
     INDEX,
-    CheckpointDraft,
     CheckpointReader,
     index_name,
     write_checkpoint,
@@ -412,17 +411,13 @@ class Store:
     def _rows_behind(self, after: int, *, arrays: bool) -> Iterator[Head]:
         with self._using("looking for rows"):
             last = self._rows.last
-
-        def rows(after: int) -> Iterator[Head]:
-            while after < last:
-                with self._using(f"reading rows behind {after}"):
-                    head = self._row_behind(after, last, arrays=arrays)
-                if head is None:
-                    return  # those that are left gave up their arrays, and a repair left them out
-                yield head
-                after = head.sequence
-
-        return rows(after)
+        while after < last:
+            with self._using(f"reading rows behind {after}"):
+                head = self._row_behind(after, last, arrays=arrays)
+            if head is None:
+                return  # those that are left gave up their arrays, and a repair left them out
+            yield head
+            after = head.sequence
 
     def _row_behind(self, after: int, last: int, *, arrays: bool) -> Head | None:
         """Return the first row behind one and up to `last`, verified, None where there is none; arrays: as a record.
@@ -543,7 +538,7 @@ class Store:
             if earlier is not None:
                 earlier.cancel()
 
-    def _draft(self, arrays: Arrays, last_sequence: int, attributes: Attributes) -> CheckpointDraft:
+    def _draft(self, arrays: Arrays, last_sequence: int, attributes: Attributes) -> Checkpoint:
         self._check_open(write=True)
         self._refuse_in_batch("committing a checkpoint")  # its rows may yet be rolled back
         first, last = self._settled().compacted, self._rows.last
@@ -553,9 +548,9 @@ class Store:
             raise RecordError(f"{what}, not {last_sequence!r}")
         if reserved := [name for name in arrays if name.startswith(INDEX)]:
             raise RecordError(f"no array may be called {reserved[0]!r}: {INDEX!r} begins the names of the store's own")
-        return CheckpointDraft(check_arrays(arrays), last_sequence, to_json("attributes", attributes))
+        return Checkpoint(0, last_sequence, from_json(to_json("attributes", attributes)), check_arrays(arrays))
 
-    def _commit(self, draft: CheckpointDraft) -> int:
+    def _commit(self, draft: Checkpoint) -> int:
         with self._committing:
             with self._using("looking where rows are"):
                 log, place = self._current.log_identity, self._rows.place(self._log, draft.last_sequence)
@@ -570,14 +565,13 @@ class Store:
             self._remove_unnamed()
             return named.number
 
-    def _write(self, draft: CheckpointDraft, place: LogPlace, log: bytes, table: np.ndarray) -> NamedCheckpoint:
+    def _write(self, draft: Checkpoint, place: LogPlace, log: bytes, table: np.ndarray) -> NamedCheckpoint:
         """Write a draft, with which rows are where in a log."""
         number = 1 + max(numbers(self._folder, CHECKPOINT, PARTIAL), default=0)
-        draft = replace(draft, arrays={**draft.arrays, index_name(log): table})
-        sha256 = write_checkpoint(self._folder, number, draft, self.identity)
-        return NamedCheckpoint(number, draft.last_sequence, sha256, place)
+        draft = replace(draft, number=number, arrays={**draft.arrays, index_name(log): table})
+        return NamedCheckpoint(number, draft.last_sequence, write_checkpoint(self._folder, draft, self.identity), place)
 
-    def _commit_later(self, draft: CheckpointDraft) -> None:
+    def _commit_later(self, draft: Checkpoint) -> None:
         try:
             self._commit(draft)
         except Exception as error:
@@ -647,7 +641,7 @@ class Store:
             # This opens the log that took its place. Where it cannot, whoever uses the store next does, or learns why.
             self._remove_unnamed()
 
-    def _compacted(self, drafts: list[CheckpointDraft]) -> Current:
+    def _compacted(self, drafts: list[Checkpoint]) -> Current:
         """Write a log in which rows have no arrays, and the checkpoints that stand for them; read all of it back."""
         number = 1 + max(numbers(self._folder, LOG, NEW), default=0)
         path = log_path(self._folder, number)

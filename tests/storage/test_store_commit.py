@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import scroll_tactile_store.store
 from quick_checkpoints import READ_BY_ZARR, WRITTEN_BY_ZARR, read_zarr, write_zarr
-from scroll_tactile_store import DamageError, Store, StoreError, check_store
-from scroll_tactile_store.checkpoint_files import CheckpointDraft, CheckpointReader, write_checkpoint
+from scroll_tactile_store import Checkpoint, DamageError, Store, StoreError, check_store
+from scroll_tactile_store.checkpoint_files import CheckpointReader, write_checkpoint
 from store_builds import contents, folders
 
 ONE = {"x": np.arange(10)}
@@ -25,11 +25,11 @@ class Gate:
         self.write = scroll_tactile_store.store.write_checkpoint
         monkeypatch.setattr(scroll_tactile_store.store, "write_checkpoint", self)
 
-    def __call__(self, parent, number, draft, identity):
+    def __call__(self, parent, draft, identity):
         self.last_sequences.append(draft.last_sequence)
         self.reached.set()
         assert self.open.wait(10)
-        return self.write(parent, number, draft, identity)
+        return self.write(parent, draft, identity)
 
 
 def test_appends_go_on_and_the_newest_waiting_commit_wins(opened, monkeypatch):
@@ -183,4 +183,4 @@ def test_every_file_has_the_bytes_that_zarr_gives_it(tmp_path, level):
 def test_the_store_writes_through_zarr_here(tmp_path, monkeypatch):
     monkeypatch.setattr("zarr.create_group", None)
     with pytest.raises(TypeError):
-        write_checkpoint(tmp_path, 1, CheckpointDraft({"a": np.ones(3)}, 1, "{}", 3), {})
+        write_checkpoint(tmp_path, Checkpoint(1, 1, {}, {"a": np.ones(3)}), {})

@@ -73,12 +73,12 @@ def test_a_damaged_row_keeps_all_from_being_given_up(opened, row, arrays):
 def test_what_was_written_is_read_back_before_it_counts(opened, monkeypatch, name):
     real = getattr(scroll_tactile_store.store, name)
 
-    def forgetful(path, number, *rest):
-        done = real(path, number, *rest)
+    def forgetful(path, written, *rest):
+        done = real(path, written, *rest)
         if name == "create_log":
             flip(path, 500)
         else:
-            spoil(path / "checkpoints" / f"{number:08d}")
+            spoil(path / "checkpoints" / f"{written.number:08d}")
         return done
 
     with monkeypatch.context() as broken, pytest.raises(DamageError):

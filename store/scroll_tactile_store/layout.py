@@ -183,10 +183,10 @@ def _numbered(folder: Path, begin: str, end: str) -> dict[Path, int]:
 
 
 def holds_store(folder: Path) -> bool:
-    """Return whether `folder` holds a store that this release reads; False when one may be made there.
+    """Return whether `folder` holds a store, or what is left of one; False when one may be made there.
 
-    Only looks. Raises NotAStoreError for a file and for a folder with other things in it, VersionError for another
-    format, and DamageError where `CURRENT` is damaged, or gone while what it named is still there.
+    Only looks. Raises NotAStoreError for a file and for a folder with other things in it, VersionError for a store of
+    releases 0.x, and DamageError as `require_safe`.
     """
     with reported(folder, "looking for a store"):
         if not folder.exists():
@@ -194,11 +194,9 @@ def holds_store(folder: Path) -> bool:
         if not folder.is_dir():
             raise NotAStoreError(f'{folder} is a file: a packed store is opened with mode="read", or merged')
         require_safe(folder)
-        try:
-            read_current(folder / CURRENT_FILE)
+        names = sorted(entry.name for entry in folder.iterdir())
+        if os.path.lexists(folder / CURRENT_FILE):  # after the names: another process may have made it meanwhile
             return True
-        except FileNotFoundError:
-            names = sorted(entry.name for entry in folder.iterdir())
         if LEGACY_FILE in names:
             raise VersionError(
                 f"{folder} was made by a release 0.x, whose memories this one does not read: learn it again from the "
@@ -206,18 +204,11 @@ def holds_store(folder: Path) -> bool:
             )
         # The first log is made before `CURRENT`: a writer may have died in between.
         logs, first = [log_path(folder, number) for number in numbers(folder, LOG)], log_path(folder, 1)
-        traces = [log.name for log in logs if log != first or _has_batches(log)]
-        traces += [name for name in names if DAMAGED in name] + [CHECKPOINTS] * any(numbers(folder, CHECKPOINT))
-        foreign = [name for name in names if not name.startswith(OURS) and name not in (LOCK_FILE, CHECKPOINTS)]
-        if os.path.lexists(folder / CURRENT_FILE):
-            return True  # another process made it meanwhile
-        if traces:
-            raise DamageError(
-                f"{folder} has {' and '.join(traces)} but no {CURRENT_FILE}: put it back from a copy, or repair the "
-                "store (repair_store), which finds what it named",
-                path=folder / CURRENT_FILE,
-            )
-        if foreign:
+        if any(DAMAGED in name for name in names) or any(numbers(folder, CHECKPOINT)):
+            return True
+        if any(log != first or _has_batches(log) for log in logs):
+            return True
+        if foreign := [name for name in names if not name.startswith(OURS) and name not in (LOCK_FILE, CHECKPOINTS)]:
             raise NotAStoreError(
                 f"{folder} holds no store but other things ({', '.join(foreign[:3])}…): nothing was written; choose an "
                 "empty or a new folder"

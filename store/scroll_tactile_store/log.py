@@ -154,9 +154,7 @@ class Log:
             elif proof is None:
                 return
             else:
-                what = (
-                    f"is damaged: frame {torn.number} is not as it was written, and {proof} proves that it was durable"
-                )
+                what = f"is damaged: frame {torn.number} is not as it was written, and was durable, as {proof} proves"
                 damaged(self._damage(f"{what}. What is before it verifies and can be kept", torn), frames)
                 if not self._resume(torn):
                     return

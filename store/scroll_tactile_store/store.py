@@ -164,14 +164,17 @@ class Store:
     def _take_current(self) -> tuple[Current, Log, Rows]:
         """Return what `CURRENT` says now, the log that it names, and the rows of that."""
         for _ in range(ATTEMPTS):
-            current = read_current(self._folder / CURRENT_FILE)
-            path = log_path(self._folder, current.log)
-            with suppress(FileNotFoundError):  # a writer removes a log after another has taken its place
-                log = Log(path, write=self.mode == "write", identity=current.log_identity)
+            try:
+                current = read_current(self._folder / CURRENT_FILE)
+                log = Log(
+                    log_path(self._folder, current.log), write=self.mode == "write", identity=current.log_identity
+                )
                 break
+            except FileNotFoundError as error:  # a writer removes a log after another has taken its place
+                gone = Path(error.filename)
         else:
-            what = f"{path}, which {CURRENT_FILE} names, is not there: put it back from a copy, or repair the store"
-            raise DamageError(f"{what} (repair_store), which resumes from what verifies", path=path)
+            what = f"{gone} is not there: put it back from a copy, or repair the store (repair_store), which resumes"
+            raise DamageError(f"{what} from what verifies", path=gone)
         try:
             return current, log, self._read(current, log)
         except BaseException:

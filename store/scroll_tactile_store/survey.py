@@ -27,7 +27,6 @@ from scroll_tactile_store.layout import (
     log_path,
     numbers,
     read_current,
-    require_safe,
     unnamed,
 )
 from scroll_tactile_store.log import BEGIN, Log
@@ -72,9 +71,9 @@ def check_store(path: str | PathLike[str], *, progress: Progress | None = None) 
         except DamageError as error:
             return [Problem(folder, str(error), "lost")]
     with reported(folder, "checking the store"):
-        require_store(folder)
         try:
-            require_safe(folder)
+            if not holds_store(folder):
+                raise NotAStoreError(f"{folder} holds no store")
         except DamageError as error:
             return [Problem(error.path, str(error), "lost")]
         for _ in range(ATTEMPTS):
@@ -84,15 +83,6 @@ def check_store(path: str | PathLike[str], *, progress: Progress | None = None) 
             if not found or survey.current == current_of(folder):
                 break
         return found + survey.leftovers()
-
-
-def require_store(folder: Path) -> None:
-    """Return where `folder` holds a store, or what is left of one. Raises NotAStoreError and VersionError."""
-    try:
-        if not holds_store(folder):
-            raise NotAStoreError(f"{folder} holds no store")
-    except DamageError:
-        return
 
 
 def current_of(folder: Path) -> Current | None:

@@ -13,7 +13,7 @@ from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from math import prod
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -22,9 +22,6 @@ from scroll_tactile_store.exceptions import DamageError, StoreError, VersionErro
 from scroll_tactile_store.files import read_regular, remove_tree, replacing, sync_folder, tree_size
 from scroll_tactile_store.layout import FORMAT_VERSION, PARTIAL, checkpoint_path, other_format
 from scroll_tactile_store.records import JSON, LARGEST_JSON, Checkpoint, from_json, json_digest
-
-if TYPE_CHECKING:
-    import zarr
 
 INDEX = "log-"  # begins the name of an array of the store's own: which rows are where in a log
 
@@ -81,20 +78,19 @@ def write_checkpoint(folder: Path, draft: Checkpoint, identity: Mapping[str, JSO
                 "last_sequence": draft.last_sequence,
                 "attributes": draft.attributes,
                 "identity": identity,
-                "files": {name: sha256 for array in draft.arrays for name, sha256 in _digests(partial, array)},
+                "files": {
+                    path.relative_to(partial).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+                    for array in draft.arrays
+                    for path in sorted((partial / array).rglob("*"))
+                    if path.is_file()
+                },
             }
             digest = json_digest(known)
             group.update_attributes(known | {"sha256": digest})
     return digest
 
 
-def _digests(group: Path, array: str) -> Iterator[tuple[str, str]]:
-    for path in sorted((group / array).rglob("*")):
-        if path.is_file():
-            yield path.relative_to(group).as_posix(), hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def _write_zarr(path: Path, arrays: Mapping[str, np.ndarray], level: int | None) -> zarr.Group:
+def _write_zarr(path: Path, arrays: Mapping[str, np.ndarray], level: int | None) -> Any:
     # Imported late: 0.3 s that a process which only appends need not spend.
     import zarr
     from zarr.codecs import ZstdCodec

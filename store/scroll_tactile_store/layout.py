@@ -91,18 +91,15 @@ class Current:
 
     @classmethod
     def from_bytes(cls, data: bytes, path: Path) -> Self:
-        """Return what `to_bytes` wrote. Raises VersionError for another format, DamageError for anything else."""
-        try:
-            known: dict[str, Any] = dict(from_json(data.decode("ascii")))
-            if known.pop("sha256", None) != json_digest(known):
-                raise ValueError("its sha256 differs")
-            if known["format"] != FORMAT_VERSION:
-                raise VersionError(other_format(path, known["format"]))
-            number, identity = known["log"]
-            newest, compaction = NamedCheckpoint.read(known["newest"]), NamedCheckpoint.read(known["compaction"])
-            return cls(_count(number), bytes.fromhex(identity), newest, compaction, _count(known.get("last", 0)))
-        except (KeyError, TypeError, ValueError) as error:
-            raise _not_as_written(path, error) from error
+        """Return what `to_bytes` wrote. Raises VersionError for another format; KeyError, TypeError, ValueError."""
+        known: dict[str, Any] = dict(from_json(data.decode("ascii")))
+        if known.pop("sha256", None) != json_digest(known):
+            raise ValueError("its sha256 differs")
+        if known["format"] != FORMAT_VERSION:
+            raise VersionError(other_format(path, known["format"]))
+        number, identity = known["log"]
+        newest, compaction = NamedCheckpoint.read(known["newest"]), NamedCheckpoint.read(known["compaction"])
+        return cls(_count(number), bytes.fromhex(identity), newest, compaction, _count(known.get("last", 0)))
 
 
 def other_format(path: Path, version: int) -> str:
@@ -110,22 +107,10 @@ def other_format(path: Path, version: int) -> str:
     what = f"{path} is written in format {version}"
     if version in OLDER:
         releases, last = OLDER[version]
-        return (
-            f"{what}, by scroll-tactile {releases}; this one reads format {FORMAT_VERSION}: learn it again from the "
-            f"recordings, or open it with scroll-tactile {last}"
-        )
-    return (
-        f"{what}; this release reads format {FORMAT_VERSION}: upgrade it, or open the store with the release that "
-        "wrote it; nothing was changed"
-    )
-
-
-def _not_as_written(path: Path, error: Exception) -> DamageError:
-    return DamageError(
-        f"{path} is not as it was written ({error}): repair the store (repair_store), which finds the log and the "
-        "checkpoints by themselves",
-        path=path,
-    )
+        what += f", by scroll-tactile {releases}; this one reads format {FORMAT_VERSION}: learn it again from the"
+        return f"{what} recordings, or open it with scroll-tactile {last}"
+    what += f"; this release reads format {FORMAT_VERSION}: upgrade it, or open the store with the release"
+    return f"{what} that wrote it; nothing was changed"
 
 
 def _count(value: Any) -> int:
@@ -137,10 +122,10 @@ def _count(value: Any) -> int:
 def read_current(path: Path) -> Current:
     """Return what the `CURRENT` at `path` says. Raises DamageError, VersionError, and OSError where it is not there."""
     try:
-        data = read_regular(path, LARGEST_CURRENT)
-    except DamageError as error:
-        raise _not_as_written(path, error) from error
-    return Current.from_bytes(data, path)
+        return Current.from_bytes(read_regular(path, LARGEST_CURRENT), path)
+    except (DamageError, KeyError, TypeError, ValueError) as error:
+        what = f"{path} is not as it was written ({error}): repair the store (repair_store), which finds"
+        raise DamageError(f"{what} the log and the checkpoints by themselves", path=path) from error
 
 
 def write_current(folder: Path, current: Current) -> None:

@@ -14,7 +14,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Self
 
-from scroll_tactile_store.exceptions import FULL, DamageError, StoreClosedError, VersionError, reported
+from scroll_tactile_store.exceptions import FULL, DamageError, VersionError, reported
 from scroll_tactile_store.files import dense_size, new_file, open_regular, replacing, sync_open
 from scroll_tactile_store.framing import (
     COMMIT,
@@ -54,8 +54,7 @@ NO_ROOM = FULL | {errno.EFBIG}
 
 def refuse(damage: DamageError, _: list[Frame]) -> None:
     """Raise what is damaged: whoever uses a store goes on behind no damage."""
-    what = f"{damage}: repair the store (repair_store)"
-    raise DamageError(what, path=damage.path, offset=damage.offset, frame=damage.frame) from damage
+    raise damage
 
 
 class Log:
@@ -81,7 +80,7 @@ class Log:
             self._read_header(identity)
             self._begin_batch()
         except BaseException:
-            self._release()
+            self.close()
             raise
 
     def _read_header(self, identity: bytes | None) -> None:
@@ -115,21 +114,16 @@ class Log:
             return bytes(self._staged[begin : begin + size])
         if (size := min(size, self.size() - offset)) <= 0 or offset < 0:
             return b""
-        os.lseek(self._open(), offset, os.SEEK_SET)
+        os.lseek(self._descriptor, offset, os.SEEK_SET)
         data = part = os.read(self._descriptor, size)
         while part and len(data) < size:
             part = os.read(self._descriptor, size - len(data))
             data += part
         return data
 
-    def _open(self) -> int:
-        if self._descriptor < 0:
-            raise StoreClosedError(f"the log {self.path} is closed")
-        return self._descriptor
-
     def size(self) -> int:
         """Return the bytes of the file. Raises DamageError where they are holes, which no log has."""
-        return dense_size(self._open(), self.path)
+        return dense_size(self._descriptor, self.path)
 
     def _is_ours(self, frame: Frame) -> bool:
         return frame.version == VERSION and frame.identity == self.identity
@@ -155,7 +149,7 @@ class Log:
                 return
             else:
                 what = f"is damaged: frame {torn.number} is not as it was written, and was durable, as {proof} proves"
-                damaged(self._damage(f"{what}. What is before it verifies and can be kept", torn), frames)
+                damaged(self._damage(f"{what}: repair the store (repair_store)", torn), frames)
                 if not self._resume(torn):
                     return
 
@@ -258,7 +252,7 @@ class Log:
     def _settle(self) -> None:
         """Cut off what is behind the last commit, where something may be; raises OSError."""
         if not self._settled:
-            os.ftruncate(self._open(), self.place.offset)
+            os.ftruncate(self._descriptor, self.place.offset)
             self._allocated = self.place.offset
             sync_open(self._descriptor)
             self._settled = True
@@ -298,7 +292,7 @@ class Log:
 
     def _put(self, offset: int, data: bytearray) -> None:
         """Write all bytes at an offset, in one call unless the system takes fewer."""
-        os.lseek(self._open(), offset, os.SEEK_SET)
+        os.lseek(self._descriptor, offset, os.SEEK_SET)
         done = os.write(self._descriptor, data)
         while done < len(data):
             done += os.write(self._descriptor, data[done:])
@@ -331,14 +325,11 @@ class Log:
 
     def close(self, *, trim: bool = False) -> None:
         """Close the file; a second call does nothing. trim: give back the room ahead, of a log that was written."""
-        if trim and self._descriptor >= 0:
-            with suppress(OSError):
-                os.ftruncate(self._descriptor, self.place.offset)
-        self._release()
-
-    def _release(self) -> None:
         descriptor, self._descriptor = self._descriptor, -1
         if descriptor >= 0:
+            with suppress(OSError):
+                if trim:
+                    os.ftruncate(descriptor, self.place.offset)
             os.close(descriptor)
 
     def __enter__(self) -> Self:

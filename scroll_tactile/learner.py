@@ -24,9 +24,8 @@ from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.tuned import TuneReport
 from scroll_tactile.persistence.ledger import Ledger
-from scroll_tactile.persistence.merge import Choice, MergeRules
-from scroll_tactile.persistence.observations import observations
-from scroll_tactile.persistence.packing import pack_memory
+from scroll_tactile.persistence.merge import Choice, pack_memory
+from scroll_tactile.persistence.observations import observations, rows_with
 from scroll_tactile.persistence.replaying import ranked_exemplars
 from scroll_tactile.persistence.sensor_rows import adapt_to, health_of, known_touches
 from scroll_tactile.prediction.features import Readings
@@ -46,7 +45,7 @@ from scroll_tactile.results import (
     Receipt,
 )
 from scroll_tactile.sensors import Sensor
-from scroll_tactile.settings import Settings, names_of, require_name, require_source, require_text
+from scroll_tactile.settings import Settings, names_of, require_name, require_source
 from scroll_tactile.signals.correction import corrected_stream
 from scroll_tactile.signals.ranges import range_problem
 from scroll_tactile.signals.stream import Stream, validate
@@ -288,8 +287,8 @@ class TactileLearner:
         stream: as for `observe`. Raises StreamError; SensorMismatchError for another sensor's stream; StoreError.
         """
         touch = self._predictor.stream(stream)
-        before = [] if touch.raw is None else self._ledger.names(touch.raw.key)  # learned before it was adapted
-        return list(dict.fromkeys([*before, *self._ledger.names(touch.key)]))
+        keys = [of.key for of in (touch.raw, touch) if of is not None]  # it may be from before an adaptation
+        return self._ledger.read(lambda memory, store: [*{n: 0 for key in keys for n in rows_with(store, memory, key)}])
 
     def observations(self) -> list[Observation]:
         """Every observation in the journal, in order, and its state. Raises StoreError."""
@@ -338,9 +337,8 @@ class TactileLearner:
         """
         if (material is None) == (source is None):
             raise InputError("say what is to be forgotten: a material, or a source")
-        if material is not None:
-            require_text(material)
-        return self._ledger.forget(material, None if source is None else require_source(source))
+        name = None if material is None else require_name(material)
+        return self._ledger.forget(name, None if source is None else require_source(source))
 
     def describe(
         self, material: str, constituents: Mapping[str, float | bool | tuple[float, str] | None] | None
@@ -614,7 +612,7 @@ class TactileLearner:
         require_arguments({"descriptions": descriptions}, {"progress": progress})
         if not isinstance(other, TactileLearner):
             require_arguments({"other": other})
-        return self._ledger.merge(source, MergeRules(descriptions=descriptions), progress or silent)[0]
+        return self._ledger.merge(source, progress or silent, choice=descriptions)[0]
 
     def backup(
         self, destination: str | os.PathLike[str], *, progress: Callable[[str, int, int], object] | None = None

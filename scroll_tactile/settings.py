@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import unicodedata
 from collections.abc import Iterable, Sequence
 from collections.abc import Set as AbstractSet
 from typing import Annotated, Any, Literal, cast
@@ -20,7 +21,6 @@ __all__ = [
     "names_of",
     "require_name",
     "require_source",
-    "require_text",
 ]
 
 LONGEST_NAME = 200  # characters
@@ -87,8 +87,13 @@ def _described(error: ValidationError, model: type[BaseModel]) -> str:
 
 
 def require_name(material: str) -> str:
-    """The name of a material, of no subclass of str such as numpy's; raises MaterialError for what cannot be one."""
-    require_text(material)
+    """The name of a material, of no subclass of str such as numpy's; raises MaterialError for what cannot be one.
+
+    Spaces around it go, and letters with marks are composed (NFC): what prints alike is one material.
+    """
+    if not isinstance(material, str):
+        raise MaterialError(f"expected a material's name as a string; came {type(material).__name__} {material!r:.60}")
+    material = _composed(material)
     if not material or len(material) > LONGEST_NAME:
         raise MaterialError(
             f"expected a name of 1 to {LONGEST_NAME} characters; came {len(material)}", argument="material"
@@ -96,6 +101,10 @@ def require_name(material: str) -> str:
     if not material.isprintable():
         raise MaterialError(f"expected a name of printable characters; came {material!r}", argument="material")
     return str(material)
+
+
+def _composed(name: str) -> str:
+    return unicodedata.normalize("NFC", name.strip())
 
 
 def require_source(source: str) -> str:
@@ -109,14 +118,11 @@ def require_source(source: str) -> str:
     return str(source)
 
 
-def require_text(material: str) -> None:
-    """Raise MaterialError for a name that is no string; one that came from elsewhere may be any."""
-    if not isinstance(material, str):
-        raise MaterialError(f"expected a material's name as a string; came {type(material).__name__} {material!r:.60}")
-
-
 def names_of(what: str, names: Iterable[str] | None, wrong: type[InputError] = InputError) -> list[str] | None:
-    """The names in a sequence or an iterator, None where it is None; `what` and `wrong` say how others are refused."""
+    """The names in a sequence or an iterator, as `require_name` writes them; None where it is None.
+
+    `what` and `wrong` say how others are refused.
+    """
     if names is None:
         return None
     advice = f". Use [{names!r:.60}]" if isinstance(names, str) else ""
@@ -124,7 +130,7 @@ def names_of(what: str, names: Iterable[str] | None, wrong: type[InputError] = I
     if not all(isinstance(name, str) for name in found):
         came = f"{type(names).__name__} {names!r:.60}"
         raise wrong(f"expected {what} as a sequence of names; came {came}{advice}")
-    return cast("list[str]", found)
+    return [_composed(name) for name in cast("list[str]", found)]
 
 
 def candidates_of(scene: Sequence[str] | None, names: list[str], known: AbstractSet[str]) -> list[str]:

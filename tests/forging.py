@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shutil
 import struct
 import zipfile
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -213,31 +212,6 @@ def refiled(path: Path, number: int) -> dict[str, Any]:
     return described(path, number) | {"files": digests}
 
 
-def put_arrays(path: Path, number: int, arrays: Mapping[str, np.ndarray], gone: Iterable[str] = ()) -> dict[str, Any]:
-    """Write arrays into a checkpoint's group, in place of those of their names; what it then has to say of itself.
-
-    They are written without any codec but that for bytes, in one chunk each, as anyone may. gone: arrays that go.
-    """
-    for name in (*arrays, *gone):
-        shutil.rmtree(group_of(path, number) / name, ignore_errors=True)
-    for name, array in arrays.items():
-        put_array(group_of(path, number) / name, np.asarray(array, order="C"))
-    return refiled(path, number)
-
-
-def put_array(folder: Path, array: np.ndarray) -> None:
-    """Write one array as a zarr array of one chunk."""
-    from quick_checkpoints import array_about
-
-    chunk = folder.joinpath("c", *["0"] * array.ndim)
-    chunk.parent.mkdir(parents=True)
-    about = array_about(array, None)
-    about["chunk_grid"]["configuration"]["chunk_shape"] = [max(1, length) for length in array.shape]
-    (folder / "zarr.json").write_text(json.dumps(about), encoding="utf-8")
-    if array.size:
-        chunk.write_bytes(array.tobytes())
-
-
 def lengthen_frame(path: Path) -> None:
     """Have the last row's frame say that it has 4 GiB."""
     log, last = log_of(path), max(frame.offset for frame in frames_of(path).values())
@@ -276,15 +250,13 @@ def largest_array(path: Path) -> tuple[int, str]:
     return number, max(sizes, key=lambda name: sizes[name])
 
 
-def change_array(path: Path, codec: str = "", data: bytes = b"", longer: int = 1, named: str = "") -> None:
-    """The newest checkpoint's largest array with another codec, bytes, last axis or name, and right checksums."""
+def change_array(path: Path, codec: str = "", data: bytes = b"", named: str = "") -> None:
+    """The newest checkpoint's largest array with another codec, bytes or name, and right checksums."""
     number, name = largest_array(path)
     folder = group_of(path, number) / name
     told = json.loads((folder / "zarr.json").read_text())
     if codec:
         told["codecs"] = [*told["codecs"][:1], {"name": codec, "configuration": {"level": 1, "checksum": False}}]
-    for shape in (told["shape"], told["chunk_grid"]["configuration"]["chunk_shape"]):
-        shape[-1] *= longer
     (folder / "zarr.json").write_text(json.dumps(told))
     if data:
         next(file for file in (folder / "c").rglob("*") if file.is_file()).write_bytes(data)

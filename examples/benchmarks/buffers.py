@@ -26,12 +26,13 @@ from scroll_tactile.clients.cli.terminal import progress_bar
 from scroll_tactile.finetune.fine_tune import fine_tune
 from scroll_tactile.finetune.network import TunedReader
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.memory.exemplars import Exemplar, ExemplarSample, herd, quotas, rank
+from scroll_tactile.memory.exemplars import Exemplar, herd, quotas, rank
 from scroll_tactile.persistence.replaying import exemplar_candidates
 from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.grid import mean_code
+from scroll_tactile.statistics.sample import Sample
 
 __all__ = ["Choice", "Chooser", "LiveHerding", "UniformRandom", "buffers", "compare", "mean_gap", "run_buffers"]
 
@@ -92,16 +93,15 @@ class UniformRandom:
 
 class _Pooled:
     def __init__(self, capacity: int, ratio: int, means: Mapping[str, IntArray]) -> None:
-        self._pool, self._means = ExemplarSample(capacity, ratio=ratio), means
+        self._pool, self._capacity, self._means = Sample[int](ratio * capacity), capacity, means
         self._felt: list[Exemplar] = []
 
     def add(self, material: str, key: bytes, code: Codes, mean: IntArray) -> None:
         self._pool.add(material, key, len(self._felt))
-        self._felt.append(Exemplar(material, key, {}, code, Scale("window", 1)))
+        self._felt.append(Exemplar(material, key, np.zeros((1, 1), np.float32), code, Scale("window", 1)))
 
     def buffer(self) -> Buffer:
-        held = [self._felt[place] for *_, place in self._pool]
-        ranked = rank(held, self._pool.exemplars, lambda material, _: self._means[material])
+        ranked = rank(map(self._felt.__getitem__, self._pool.touches()), self._capacity, lambda m, _: self._means[m])
         return {name: [exemplar.key for exemplar in chosen] for name, chosen in ranked.items()}
 
 

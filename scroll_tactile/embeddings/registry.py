@@ -25,14 +25,12 @@ from scroll_tactile.embeddings.protocol import Embedding, cache_folder
 from scroll_tactile.errors import EmbeddingError
 
 __all__ = [
-    "MOST_DEPTH",
     "MOST_PARTS",
     "configuration_of",
     "from_configuration",
     "require_configuration",
 ]
 
-MOST_DEPTH: Final = 16  # mappings and lists within each other
 MOST_PARTS: Final = 8  # of a Joined
 MOST_COSINES = 2**14
 MOST_PIXELS = 2**24  # of a resting picture, times colours: 64 MiB

@@ -129,7 +129,7 @@ def fine_tune(
         seconds=time.perf_counter() - begun,
         digest=tuned.digest(),
     )
-    return replace(tuned, report=Tuned.described(report)), report
+    return replace(tuned, report={k: own for k, own in vars(report).items() if k not in ("seconds", "digest")}), report
 
 
 def fine_tune_memory(
@@ -154,7 +154,7 @@ def fine_tune_memory(
         device=device,
         progress=progress,
     )
-    ledger.keep_tuned(tuned, memory, last_sequence, retractions)
+    ledger.keep_tuned(tuned, last_sequence, retractions)
     return report
 
 

@@ -236,16 +236,15 @@ class _Earlier(NamedTuple):
 class WatchedRows:
     """A watch, by which rules it was made, and copies of it as it was before.
 
-    last: the row up to which it has taken them. known: the row up to which retractions are known. lost: how often the
-    memory had lost rows when it began.
+    last: the row up to which it has taken them. known: the row up to which retractions are known.
 
     The copies lie apart by at most 64 rows, or by as many as have come since: one goes back by few rows where the last
     is retracted, and n rows have some 2 log₂(n / 64) of them, of 35 kB (19 channels) or 300 kB (60) each, beside the
     cells as they were: 0.7 MB each after 4000 rows of 19 channels.
     """
 
-    def __init__(self, rules: WatchRules, channels: int, lost: int = 0) -> None:
-        self.rules, self.watch, self.lost = rules, Watch(channels, rules.bound), lost
+    def __init__(self, rules: WatchRules, channels: int) -> None:
+        self.rules, self.watch = rules, Watch(channels, rules.bound)
         self.last, self.known = rules.after, 0
         self._earlier = [_Earlier(rules.after, self.watch.copy(), 0)]  # the first is before all rows
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from numbers import Real
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -20,7 +20,6 @@ __all__ = [
     "Target",
     "checked",
     "constituents_of",
-    "describe",
     "require_constituents",
     "require_units",
     "targets_of",
@@ -38,46 +37,28 @@ Or a property of the material → its value and unit.
 SLACK = 1e-6  # of shares that are to sum to one: thirds of six digits pass, a forgotten percent does not
 
 
-def _name(name: Any) -> str:
-    if not isinstance(name, str) or not 0 < len(name) <= LONGEST_NAME or not name.isprintable():
-        raise ValueError(f"expected constituents as names of 1 to {LONGEST_NAME} printable characters; came {name!r}")
-    return name
+def _require(holds: bool, said: str) -> None:
+    if not holds:
+        raise DescriptionError(said)
 
 
-def _value(value: Any) -> float | bool | Property | None:
-    if isinstance(value, tuple | list):
-        return _property(value)
+def _value(where: str, value: Any) -> float | bool | Property | None:
+    """A value as it is kept. −0 becomes 0: equal descriptions must be equal on the disk."""
     if value is None or isinstance(value, bool | np.bool_):
         return None if value is None else bool(value)
-    if not isinstance(value, Real):
-        raise ValueError(f"expected a share from 0 to 1, True, False, None or (value, unit); came {value!r:.60}")
-    share = float(value)
-    if not math.isfinite(share) or share < 0 or share > 1 + SLACK:
-        hint = ". Shares are parts of one, not percent" if 1 < share <= 100 else ""
-        raise ValueError(f"expected a share from 0 to 1; came {share:g}{hint}")
-    return share + 0.0  # −0 becomes 0: equal descriptions must be equal on the disk
-
-
-def _property(pair: Sequence[Any]) -> Property:
-    said = f"expected a property as (value, unit), such as (62, 'Shore A'); came {pair!r:.60}"
-    if len(pair) != 2 or isinstance(pair[0], bool) or not isinstance(pair[0], Real) or not isinstance(pair[1], str):
-        raise ValueError(said)
-    value, unit = float(pair[0]), str(pair[1])
-    if not (math.isfinite(value) and 0 < len(unit) <= LONGEST_UNIT and unit.isprintable()):
-        raise ValueError(f"{said}; the value finite, the unit of 1 to {LONGEST_UNIT} printable characters")
-    return [value + 0.0, unit]
-
-
-def _require_sum(values: Collection[float | bool | Property | None]) -> None:
-    if not values:
-        raise ValueError("expected at least one constituent; came none. None in place of the mapping removes it")
-    shares = [value for value in values if isinstance(value, float)]
-    total, unknown = math.fsum(shares), None in values
-    if shares and (total > 1 + SLACK or (total < 1 - SLACK and not unknown)):
-        raise ValueError(
-            f"expected the shares to sum to {'at most ' if unknown else ''}one; they sum to {total:.6g}. Name all "
-            "constituents, or give None for those whose share is unknown"
-        )
+    if isinstance(value, tuple | list):
+        number, unit = value if len(value) == 2 else (None, None)
+        sound = isinstance(number, Real) and not isinstance(number, bool) and math.isfinite(number)
+        sound = sound and isinstance(unit, str) and 0 < len(unit) <= LONGEST_UNIT and unit.isprintable()
+        what = f"(62, 'Shore A'), the value finite, the unit of 1 to {LONGEST_UNIT} printable characters"
+        _require(sound, f"{where}: expected a property as (value, unit), such as {what}; came {value!r:.60}")
+        return [float(cast(float, number)) + 0.0, str(unit)]
+    expected = "a share from 0 to 1, True, False, None or (value, unit)"
+    _require(isinstance(value, Real), f"{where}: expected {expected}; came {value!r:.60}")
+    share = float(value) + 0.0
+    hint = ". Shares are parts of one, not percent" if 1 < share <= 100 else ""
+    _require(0 <= share <= 1 + SLACK, f"{where}: expected a share from 0 to 1; came {share:g}{hint}")
+    return share
 
 
 def checked(material: str, constituents: Mapping[str, Any]) -> Description:
@@ -87,30 +68,26 @@ def checked(material: str, constituents: Mapping[str, Any]) -> Description:
     values, shares that are negative or not finite, and shares that do not sum to one (with None among the values: that
     sum to more).
     """
-    where = f"the description of {material!r}"
-    if not isinstance(constituents, Mapping):
-        raise DescriptionError(
-            f"expected {where} as a mapping from constituents to shares, such as {{'wool': 0.35, 'viscose': 0.65}}; "
-            f"came {type(constituents).__name__} {constituents!r:.60}"
-        )
-    found: Description = {}
-    try:
-        for name, value in sorted(constituents.items(), key=lambda named: str(named[0])):
-            where = f"the description of {material!r}, {name!r}"
-            found[_name(name)] = _value(value)
-        where = f"the description of {material!r}"
-        _require_sum(found.values())
-    except ValueError as error:
-        raise DescriptionError(f"{where}: {error}") from None
+    where, found = f"the description of {material!r}", dict[str, Any]()
+    _require(
+        isinstance(constituents, Mapping),
+        f"expected {where} as a mapping from constituents to shares, such as {{'wool': 0.35, 'viscose': 0.65}}; came "
+        f"{type(constituents).__name__} {constituents!r:.60}",
+    )
+    for name, value in sorted(constituents.items(), key=lambda named: str(named[0])):
+        usable = isinstance(name, str) and 0 < len(name) <= LONGEST_NAME and name.isprintable()
+        expected = f"constituents as names of 1 to {LONGEST_NAME} printable characters"
+        _require(usable, f"{where}: expected {expected}; came {name!r}")
+        found[name] = _value(f"{where}, {name!r}", value)
+    _require(bool(found), f"{where}: expected at least one constituent. None in place of the mapping removes it")
+    shares, unknown = [value for value in found.values() if isinstance(value, float)], None in found.values()
+    total = math.fsum(shares)
+    _require(
+        not shares or (total <= 1 + SLACK and (total >= 1 - SLACK or unknown)),
+        f"{where}: expected the shares to sum to {'at most ' if unknown else ''}one; they sum to {total:.6g}. Name all "
+        "constituents, or give None for those whose share is unknown",
+    )
     return found
-
-
-def describe(descriptions: dict[str, Description], material: str, constituents: Any) -> None:
-    """Keep what a material is made of, in place of its description before; None removes the description."""
-    if constituents is None:
-        descriptions.pop(material, None)
-    else:
-        descriptions[material] = dict(constituents)
 
 
 def constituents_of(description: Description) -> dict[str, float | bool | None]:

@@ -15,29 +15,18 @@ from typing import Annotated, Self
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.errors import InputError
-from scroll_tactile.memory.touch_rows import Arrays, Codes, Readings, unpack_readings
+from scroll_tactile.memory.touch_rows import Codes, Readings
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.fields import Ints, Must, key_rows
 from scroll_tactile.statistics.grid import BITS
-from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.sample import Sample, SampledTouch, Stages, TouchFields
 from scroll_tactile.statistics.statistics import LONGEST_TOUCH
 
-__all__ = [
-    "CANDIDATES",
-    "Exemplar",
-    "ExemplarFields",
-    "ExemplarSample",
-    "herd",
-    "quotas",
-    "rank",
-]
+__all__ = ["CANDIDATES", "Exemplar", "ExemplarFields", "herd", "quotas", "rank"]
 
 # Kept for each place in the buffer. With 3 the gap to the class mean is at most 1.08 times that of herding from every
 # touch (BioTac and RoboSkin, five folds, 5 to 20 exemplars a material); with 2 it reaches 1.24, with 4 it is 1.06.
 CANDIDATES = 3
-LARGEST_HERDED = 2 ** (53 - 2 * BITS)  # of codes: a product of two rows is then exact in float64
 
 
 def herd(candidates: npt.NDArray[np.integer], keys: Sequence[bytes], mean: Ints, count: int) -> list[int]:
@@ -48,37 +37,19 @@ def herd(candidates: npt.NDArray[np.integer], keys: Sequence[bytes], mean: Ints,
     ‖x‖² − 2 x·(kμ − Σ_{j<k} x_j), so the order is the same on every machine and whatever the order of the candidates,
     and fewer are a beginning of more.
 
-    candidates: codes of shape (N, d), of magnitude at most 2²⁰, d at most 8192. keys: N different content hashes.
-    mean: μ, codes of shape (d,). Raises InputError for more features, or larger codes.
+    candidates: codes of shape (N, d). keys: N different content hashes. mean: μ, codes of shape (d,).
     """
-    features, ends = (
-        candidates.shape[1],
-        [(int(each.min(initial=0)), int(each.max(initial=0))) for each in (candidates, mean)],
-    )
-    largest = max(max(-low, high) for low, high in ends)
-    if features > LARGEST_HERDED or largest > 2**BITS:
-        raise InputError(
-            f"expected codes of at most {LARGEST_HERDED} features, of magnitude at most {2**BITS}; came {features} "
-            f"features, and {largest}. Round features by to_codes"
-        )
     order = sorted(range(len(keys)), key=keys.__getitem__)
-    rows, target = candidates[order].astype(np.float64), mean.astype(np.float64)
-    left, chosen = list(range(len(rows))), list[int]()
-    with one_thread():
-        # Each product of rows is below 2⁵³, exact in any order. Scores are Python's integers: at step k they may reach
-        # (4k − 1)·d·2⁴⁰, which from d·k = 2²¹ on would not fit 64 bits.
-        towards = _whole(rows @ target)
-        scores = _whole(np.einsum("nd,nd->n", rows, rows)) - 2 * towards
-        while left and len(chosen) < count:
-            pick = min(left, key=scores.__getitem__)  # the first of equal ones: by key
-            left.remove(pick)
-            chosen.append(order[pick])
-            scores = scores + 2 * (_whole(rows @ rows[pick]) - towards)
+    rows, left, chosen = candidates[order].astype(np.int64), list(range(len(keys))), list[int]()
+    # A product of two rows fits 64 bits. Scores are Python's integers: at step k they reach (4k − 1)·d·2⁴⁰.
+    towards = (rows @ mean.astype(np.int64)).astype(object)
+    scores = np.einsum("nd,nd->n", rows, rows).astype(object) - 2 * towards
+    while left and len(chosen) < count:
+        pick = min(left, key=scores.__getitem__)  # the first of equal ones: by key
+        left.remove(pick)
+        chosen.append(order[pick])
+        scores = scores + 2 * ((rows @ rows[pick]).astype(object) - towards)
     return chosen
-
-
-def _whole(values: npt.NDArray[np.float64]) -> npt.NDArray[np.object_]:
-    return values.astype(np.int64).astype(object)
 
 
 def quotas(available: Mapping[str, int], capacity: int) -> dict[str, int]:
@@ -99,29 +70,22 @@ def quotas(available: Mapping[str, int], capacity: int) -> dict[str, int]:
 class Exemplar:
     """A stream with its readings, and what herding needs of it.
 
-    packed: its readings as arrays of a journal row. code: its mean row of codes at its last stage and widest windows,
-    int32 of shape (d,). scale: theirs.
+    readings: float32 of shape (T, n), for a camera (T, height, width, 3), in the sensor's unit. code: its mean row of
+    codes at its last stage and widest windows, int32 of shape (d,). scale: theirs.
     """
 
     material: str
     key: bytes
-    packed: Arrays
+    readings: Readings
     code: npt.NDArray[np.int32]
     scale: Scale
 
     @classmethod
-    def of(cls, material: str, key: bytes, packed: Arrays, stages: Stages, codes: Codes) -> Exemplar:
+    def of(cls, material: str, key: bytes, readings: Readings, stages: Stages, codes: Codes) -> Self:
         """The exemplar of a stream; stages: those that it reached. codes: its rows by scale, its own first."""
         # Not by a view: the tuned model is trained on windows.
         windows = [{scale: rows for scale, rows in stage.items() if scale.kind == "window"} for stage in stages]
-        return cls(material, key, packed, SampledTouch.of(windows, codes).rows[-1], max(windows[-1]))
-
-    @property
-    def readings(self) -> Readings:
-        """Float32 of shape (T, n), for a camera (T, height, width, 3), in the sensor's unit."""
-        readings = unpack_readings(self.packed)
-        assert readings is not None
-        return readings
+        return cls(material, key, readings, SampledTouch.of(windows, codes).rows[-1], max(windows[-1]))
 
 
 @dataclass
@@ -140,44 +104,20 @@ class HeldFields:
 
 @dataclass
 class ExemplarFields(TouchFields):
-    """What a store keeps of an `ExemplarSample`. sources: rows, (n,). held: their touches, where no row has them."""
+    """What a store keeps of the candidates for the buffer, a sample of rows of the journal.
+
+    sources: the row in which the readings of each lie; 0 or a compacted row: the compaction checkpoint, (n,). held:
+    their touches, where no row has them.
+    """
 
     sources: Annotated[Ints, Must("int64", "n", 0)]
     held: HeldFields | None = None
 
-    def exemplars(self) -> list[Exemplar]:
-        """The exemplars that came with their readings."""
-        if self.held is None:
-            return []
-        parts = np.split(self.held.readings, np.cumsum(self.held.lengths)[:-1])
-        scales = [Scale.numbered(number) for number in self.held.scales.tolist()]
-        own = zip(self.named(), parts, self.held.codes, scales, strict=False)
-        return [Exemplar(name, key, {"readings": each}, code, scale) for (name, key, _), each, code, scale in own]
-
-
-class ExemplarSample(Sample[int]):
-    """The candidates for the buffer: a function of the set of streams observed (see `Sample`).
-
-    Of each it has the row of the journal in which its readings lie; 0 or a compacted row: the compaction checkpoint.
-
-    exemplars: streams in the buffer; `ratio` times as many candidates are kept.
-    ratio: at 1 the buffer is a random choice; more candidates come nearer to the class mean.
-
-    Raises InputError for a number of exemplars or a ratio below 1.
-    """
-
-    def __init__(self, exemplars: int, *, ratio: int = CANDIDATES) -> None:
-        if min(exemplars, ratio) < 1:
-            raise InputError(
-                f"expected exemplars and a ratio of candidates to them of 1 or more; came {exemplars} and {ratio}"
-            )
-        super().__init__(ratio * exemplars)
-        self.exemplars = exemplars
-
-    def to_fields(self, candidates: Sequence[Exemplar] | None = None) -> ExemplarFields:
-        """What a store keeps; candidates: with their readings, for what leaves the rows of the journal behind."""
+    @classmethod
+    def of(cls, sample: Sample[int], candidates: Sequence[Exemplar] | None = None) -> Self:
+        """What is kept; candidates: with their readings, for what leaves the rows of the journal behind."""
         if candidates is None:
-            return ExemplarFields(*self.named(), np.array(list(self.items()), np.int64))
+            return cls(*sample.named(), np.array(sample.touches(), np.int64))
         readings = [candidate.readings for candidate in candidates]
         held = HeldFields(
             np.array([len(touch) for touch in readings], np.int64),
@@ -186,16 +126,21 @@ class ExemplarSample(Sample[int]):
             np.concatenate(readings) if readings else np.zeros((0, 0), np.float32),
         )
         names, keys = [one.material for one in candidates], key_rows([one.key for one in candidates])
-        return ExemplarFields(names, [], keys, np.zeros(len(names), np.int64), held)
+        return cls(names, [], keys, np.zeros(len(names), np.int64), held)
 
-    def fill(self, kept: ExemplarFields, source: int) -> Self:
-        """Take in what `to_fields` gave. source: the row of those that come with their readings.
+    def rows(self, source: int) -> list[tuple[str, bytes, int]]:
+        """The sample as it was, of which one of fewer keeps the first. source: the row of those with readings."""
+        sources = self.sources.tolist() if self.held is None else [source] * len(self.materials)
+        return [(name, key, row) for (name, key, _), row in zip(self.named(), sources, strict=True)]
 
-        A sample of fewer keeps the first; one of more lacks what was dropped before.
-        """
-        sources = kept.sources.tolist() if kept.held is None else [source] * len(kept.materials)
-        self.update((*each[:2], row) for each, row in zip(kept.named(), sources, strict=True))
-        return self
+    def exemplars(self) -> list[Exemplar]:
+        """The exemplars that came with their readings."""
+        if self.held is None:
+            return []
+        parts = np.split(self.held.readings, np.cumsum(self.held.lengths)[:-1])
+        scales = [Scale.numbered(number) for number in self.held.scales.tolist()]
+        own = zip(self.named(), parts, self.held.codes, scales, strict=False)
+        return [Exemplar(name, key, readings, code, scale) for (name, key, _), readings, code, scale in own]
 
 
 def rank(candidates: Iterable[Exemplar], count: int, means: Callable[[str, Scale], Ints]) -> dict[str, list[Exemplar]]:
@@ -215,8 +160,7 @@ def rank(candidates: Iterable[Exemplar], count: int, means: Callable[[str, Scale
 def _herded(candidates: list[Exemplar], means: Callable[[str, Scale], Ints], count: int) -> list[Exemplar]:
     widest = max(exemplar.scale for exemplar in candidates)
     wide = [exemplar for exemplar in candidates if exemplar.scale == widest]
-    brief = [exemplar for exemplar in candidates if exemplar.scale != widest]
-    brief.sort(key=lambda exemplar: (-int(exemplar.scale), exemplar.key))
+    brief = sorted((one for one in candidates if one.scale != widest), key=lambda one: (-int(one.scale), one.key))
     codes, keys = np.stack([exemplar.code for exemplar in wide]), [exemplar.key for exemplar in wide]
     order = herd(codes, keys, means(candidates[0].material, widest), count)
     return ([wide[place] for place in order] + brief)[:count]

@@ -3,98 +3,49 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Self, cast
+from typing import Annotated, Any, Self, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
 from scroll_tactile_store import Checkpoint, Head, Record
 
+from scroll_tactile.errors import MismatchError
 from scroll_tactile.matching.kept_arrays import KeptTouch
-from scroll_tactile.memory.descriptions import Description, checked
-from scroll_tactile.memory.exemplars import Exemplar, ExemplarFields, ExemplarSample
+from scroll_tactile.memory.descriptions import Description
+from scroll_tactile.memory.exemplars import CANDIDATES, Exemplar, ExemplarFields
 from scroll_tactile.memory.touch_rows import (
     Changed,
     Codes,
     Encode,
     Readings,
     annotation_of,
-    declaration,
-    place_of,
     refusing,
-    row_codes,
+    unpack_codes,
     unpack_readings,
 )
 from scroll_tactile.memory.tuned import Tuned
 from scroll_tactile.quantities import Quantity
 from scroll_tactile.recipe import Recipe
-from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.correction import Correction
 from scroll_tactile.signals.levels import LevelArray, levels_of
-from scroll_tactile.statistics.annotations import NO_ANNOTATION, Annotation, TargetFields, TargetSums
+from scroll_tactile.statistics.annotations import NO_ANNOTATION, TargetFields, TargetSums
 from scroll_tactile.statistics.fields import Bytes, Ints, Must, Name, decode, encode
 from scroll_tactile.statistics.sample import Sample, SampledTouch, SampleFields, TouchFields, TouchSample
 from scroll_tactile.statistics.statistics import LONGEST_TOUCH, Statistics, StatisticsFields
 
-__all__ = ["MOST_CORRECTIONS", "KeptTouches", "Memory", "MemoryFields"]
+__all__ = ["MOST_CORRECTIONS", "KeptFields", "Memory", "MemoryFields"]
 
 LONGEST_KEPT = 2.0  # times the usual length: what is kept of a touch
+T = TypeVar("T", SampledTouch, KeptTouch)
 MOST_CORRECTIONS = 16  # that a memory can come back to, one retraction after another
-
-
-class KeptTouches(Sample[KeptTouch]):
-    """Kept touches: a bounded sample of what was observed, as levels, to compare others with (see `matching.matcher`).
-
-    A function of the set of touches observed: at most `capacity` of a sensor's.
-    """
-
-    def __init__(self, sensor: Sensor, capacity: int) -> None:
-        super().__init__(capacity)
-        self.sensor = sensor
-
-    @property
-    def most_columns(self) -> int:
-        """Of a touch that is kept: twice the usual length."""
-        return max(2, round(LONGEST_KEPT * self.sensor.readings))
-
-    def levels(self, readings: npt.NDArray[np.floating]) -> LevelArray:
-        """What is kept of readings (T, C) in the sensor's unit: levels (C, T'), T' at most `most_columns`."""
-        return levels_of(readings[: self.most_columns], self.sensor)
-
-    def touches(self) -> list[KeptTouch]:
-        """All of them, by material and key."""
-        return list(self.items())
-
-    def take(
-        self,
-        material: str,
-        key: bytes,
-        readings: npt.NDArray[np.floating] | None,
-        annotation: Annotation = NO_ANNOTATION,
-    ) -> None:
-        """Keep a touch where it belongs in, if its readings are there."""
-        if readings is not None and self.wants(material, key):
-            self.add(material, key, KeptTouch(material, key, self.levels(readings), annotation))
-
-    def to_fields(self) -> KeptFields:
-        """What a store keeps of them."""
-        levels = np.concatenate([np.zeros(0, np.uint8), *(touch.levels.ravel() for touch in self.items())])
-        columns = np.array([touch.levels.shape[1] for touch in self.items()], dtype=np.int64)
-        return KeptFields(*self.named(), columns, levels)
-
-    def fill(self, kept: KeptFields) -> None:
-        """Take in what `to_fields` gave."""
-        channels = self.sensor.channels
-        parts = np.split(kept.levels, np.cumsum(kept.columns * channels)[:-1])
-        for (material, key, annotation), levels in zip(kept.named(), parts, strict=False):
-            self.add(material, key, KeptTouch(material, key, levels.reshape(channels, -1), annotation))
 
 
 @dataclass
 class KeptFields(TouchFields):
-    """What a store keeps of `KeptTouches`.
+    """What a store keeps of kept touches.
 
     columns: the length of each touch, (n,). levels: of each touch, channel by channel, (Σ columns · channels,).
     """
@@ -102,13 +53,28 @@ class KeptFields(TouchFields):
     columns: Annotated[Ints, Must("int64", "n", 1, LONGEST_TOUCH)]
     levels: Annotated[Bytes, Must("uint8", "*")]
 
+    @classmethod
+    def of(cls, kept: Sample[KeptTouch]) -> Self:
+        """The fields of kept touches."""
+        levels = np.concatenate([np.zeros(0, np.uint8), *(touch.levels.ravel() for touch in kept.touches())])
+        return cls(*kept.named(), np.array([touch.levels.shape[1] for touch in kept.touches()], dtype=np.int64), levels)
+
+    def touches(self, channels: int) -> list[tuple[str, bytes, KeptTouch]]:
+        """The kept touches that these fields were made of, of a sensor of so many channels."""
+        parts = np.split(self.levels, np.cumsum(self.columns * channels)[:-1])
+        return [
+            (material, key, KeptTouch(material, key, levels.reshape(channels, -1), annotation))
+            for (material, key, annotation), levels in zip(self.named(), parts, strict=False)
+        ]
+
 
 @dataclass
 class MemoryFields:
     """What a checkpoint holds of a memory; see `Memory`, and `statistics.fields` for the names of its arrays.
 
-    retracted, excluded: rows of the journal, (n,). descriptions: by material. quantities: by name, without it.
-    corrections: the row of each, and its text. weighings: by axis, "" for materials.
+    retracted, excluded: rows of the journal behind the compacted ones, and among these, (n,). descriptions: by
+    material. quantities: by name, without it. corrections: the row of each, and its text. weighings: by axis, "" for
+    materials.
     """
 
     statistics: StatisticsFields
@@ -131,12 +97,9 @@ class MemoryFields:
 
         Raises DamageError.
         """
-        with refusing(path, *place_of(held)):
+        with refusing(path, held):
             sizes = {"d": dimension, "triangle": dimension * (dimension + 1) // 2}
-            made = decode(cls, held.arrays, held.attributes, sizes)
-            for material, constituents in made.descriptions.items():
-                checked(material, constituents)
-            return made
+            return decode(cls, held.arrays, held.attributes, sizes)
 
 
 class Memory:
@@ -149,7 +112,7 @@ class Memory:
 
     - statistics: exact sums by scale. targets: those of values and labels.
     - sample: the touches that readouts are calibrated on.
-    - kept: touches to match with; None where the recipe keeps none.
+    - kept: touches as levels, to compare others with (see `matching.matcher`); None where the recipe keeps none.
     - exemplars: the candidates for the buffer, and where their readings lie; None where the recipe has no buffer.
     - descriptions: material → what it is made of; the material need not have been observed.
     - quantities: those that touches can carry, by name.
@@ -163,8 +126,7 @@ class Memory:
 
     - sequence: the last row that it holds.
     - compacted: the last row whose arrays were compacted; 0 before any compaction.
-    - retracted: the retracted sequences after `compacted`.
-    - excluded: the retracted sequences up to `compacted`, which the compaction checkpoint was made without.
+    - retracted: the retracted sequences; the compaction checkpoint was made without those up to `compacted`.
     - retractions: how many observations were retracted since the memory was loaded.
     - checkpoint, saved: the checkpoint that it was loaded from, and the last row in that; None and 0 without one.
     - stale: whether sample, kept touches or exemplars held what was retracted since they were chosen.
@@ -176,12 +138,11 @@ class Memory:
         self.statistics = Statistics(recipe.embedding.dimension, self.plan.scales)
         self.targets = TargetSums(recipe.embedding.dimension, self.plan.scales)
         self.sample = TouchSample()
-        self.kept = KeptTouches(recipe.sensor, recipe.kept_touches) if recipe.kept_touches else None
-        self.exemplars = ExemplarSample(recipe.exemplars) if recipe.exemplars else None
+        self.kept: Sample[KeptTouch] | None = Sample(recipe.kept_touches) if recipe.kept_touches else None
+        self.exemplars: Sample[int] | None = Sample(CANDIDATES * recipe.exemplars) if recipe.exemplars else None
         self.tuned: Tuned | None = None
         self.tuned_last_sequence = 0
         self.retracted: set[int] = set()
-        self.excluded: set[int] = set()
         self.checkpoint: int | None = None
         self.sequence = self.compacted = self.saved = self.retractions = 0
         self.descriptions: dict[str, Description] = {}
@@ -212,15 +173,15 @@ class Memory:
         Raises CapacityError before anything is added.
         """
         columns, codes = self.codes(row) if codes is None else (cast(int, row.attributes["columns"]), codes)
-        material, key, annotation = row.label, row.key, annotation_of(row.attributes)
-        self.statistics.add(material, codes, columns)
-        self.targets.add(material, key, annotation, codes, columns)
-        if self.sample.wants(material, key):
-            self.sample.add(material, key, self._touch(columns, codes, annotation))
-        if self.kept is not None and self.kept.wants(material, key):
-            self.kept.take(material, key, unpack_readings(row.arrays), annotation)
+        touch, annotation = (row.label, row.key), annotation_of(row.attributes)
+        self.statistics.add(row.label, codes, columns)
+        self.targets.add(*touch, annotation, codes, columns)
+        if self.sample.wants(*touch):
+            self.sample.add(*touch, self._sampled(row, columns, codes))
+        if self.kept is not None and self.kept.wants(*touch) and row.attributes.get("nbytes"):
+            self.kept.add(*touch, self._levelled(row))
         self.add_exemplar(row)
-        return Changed(material, annotation.labels)
+        return Changed(row.label, annotation.labels)
 
     def add_exemplar(self, row: Head) -> None:
         """Add an observation to the candidates for exemplars, if its row holds readings."""
@@ -239,9 +200,8 @@ class Memory:
         self.retracted.add(row.sequence)
         self.retractions += 1
         self.weighings.clear()
-        if any(sample.holds(material, key) for sample in self.samples):
-            self.stale = True
-        if row.sequence <= self.tuned_last_sequence:
+        self.stale |= any(sample.holds(material, key) for sample in self.samples)
+        if row.sequence <= self.tuned_last_sequence <= self.sequence:  # a reader may have one from behind this
             self.tuned = None
         return Changed(material, annotation.labels)
 
@@ -255,27 +215,15 @@ class Memory:
 
         record: reads the row of one. made: a memory whose samples have some of them ready.
         """
-        touches = {(material, key): touch for material, key, touch in made.sample}
-
-        def touch(head: Head) -> SampledTouch:
-            annotation = annotation_of(head.attributes)  # another one where the touch was retracted in between
-            if (own := touches.get((head.label, head.key))) is not None:
-                return replace(own, annotation=annotation)
-            return self._touch(*self.codes(record(head.sequence)), annotation)
-
-        self.sample.refill(((head.label, head.key, head) for head in heads), touch)
         read = [head for head in heads if head.attributes.get("nbytes")]  # whose rows hold readings
+
+        def sampled(head: Head) -> SampledTouch:
+            row = record(head.sequence)
+            return self._sampled(row, *self.codes(row))
+
+        _refill(self.sample, heads, made.sample, sampled)
         if self.kept is not None:
-            mine, kept = {(material, key): own for material, key, own in made.kept or ()}, self.kept
-
-            def keep(head: Head) -> KeptTouch:
-                annotation = annotation_of(head.attributes)
-                if (own := mine.get((head.label, head.key))) is not None:
-                    return replace(own, annotation=annotation)
-                levels = kept.levels(cast(Readings, unpack_readings(record(head.sequence).arrays)))
-                return KeptTouch(head.label, head.key, levels, annotation)
-
-            self.kept.refill(((head.label, head.key, head) for head in read), keep)
+            _refill(self.kept, read, made.kept or (), lambda head: self._levelled(record(head.sequence)))
         if self.exemplars is not None:
             self.exemplars.update((head.label, head.key, head.sequence) for head in read)
 
@@ -283,17 +231,47 @@ class Memory:
         """An empty memory of this recipe."""
         return Memory(self.recipe, self.encode)
 
-    def is_gone(self, sequence: int) -> bool:
-        """Whether this observation was retracted, as far as the memory itself knows."""
-        return sequence in self.retracted or sequence in self.excluded
+    def of_axis(self, axis: str) -> Memory:
+        """What was learned by the labels on an axis: its statistics follow it; samples are as they are now.
+
+        Empty where no touch has a label on the axis. It has no exemplars, descriptions or f*.
+        """
+        view = self.empty_like()
+        view.exemplars, view.sequence, view.retractions = None, self.sequence, self.retractions
+        view.statistics = self.targets.axes.get(axis, view.statistics)
+        for _, key, touch in self.sample:
+            if (label := touch.annotation.label(axis)) is not None:
+                view.sample.add(label, key, replace(touch, annotation=NO_ANNOTATION))
+        for _, key, kept in self.kept or ():
+            if view.kept is not None and (label := kept.annotation.label(axis)) is not None:
+                view.kept.add(label, key, replace(kept, material=label, annotation=NO_ANNOTATION))
+        return view
 
     def codes(self, record: Record) -> tuple[int, Codes]:
-        """The columns of an observation, and its rows of codes by scale."""
-        columns = cast(int, record.attributes["columns"])
-        return columns, row_codes(record.arrays, self.encode)
+        """The columns of an observation, and its rows of codes by scale.
 
-    def _touch(self, columns: int, codes: Codes, annotation: Annotation) -> SampledTouch:
-        return SampledTouch.of(self.plan.scored_stages(columns), codes, annotation)
+        Raises MismatchError for readings alone that this memory cannot embed.
+        """
+        if not (codes := unpack_codes(record.arrays)):
+            if self.encode is None:
+                raise MismatchError(
+                    "a row holds readings alone, which can be embedded only by the embedding that made the memory: "
+                    "open it with TactileLearner.open(path, embedding=...)"
+                )
+            codes = self.encode(cast(Readings, unpack_readings(record.arrays)))
+        return cast(int, record.attributes["columns"]), codes
+
+    def _sampled(self, row: Head, columns: int, codes: Codes) -> SampledTouch:
+        return SampledTouch.of(self.plan.scored_stages(columns), codes, annotation_of(row.attributes))
+
+    def _levelled(self, row: Record) -> KeptTouch:
+        levels = self.levels(cast(Readings, unpack_readings(row.arrays)))
+        return KeptTouch(row.label, row.key, levels, annotation_of(row.attributes))
+
+    def levels(self, readings: npt.NDArray[np.floating]) -> LevelArray:
+        """What is kept of readings (T, C) in the sensor's unit: levels (C, T'), T' at most twice the usual length."""
+        sensor = self.recipe.sensor
+        return levels_of(readings[: max(2, round(LONGEST_KEPT * sensor.readings))], sensor)
 
     def take_chosen(self, other: Memory) -> None:
         """Take sample, kept touches and exemplars of a memory in place of its own."""
@@ -304,12 +282,6 @@ class Memory:
         self.statistics, self.targets = memory.statistics - later.statistics, memory.targets - later.targets
         self.compacted, self.sequence, self.tuned = memory.compacted, last_sequence, None
         self.retracted = set(memory.retracted)
-
-    def note_compaction(self, last: int) -> None:
-        """Have a compaction checkpoint stand for rows up to one: what was retracted of them is out of it for good."""
-        self.compacted = last
-        self.excluded |= {sequence for sequence in self.retracted if sequence <= last}
-        self.retracted = {sequence for sequence in self.retracted if sequence > last}
 
     def join(self, other: Memory, *, exemplars: bool = True) -> None:
         """Add another memory of the same making; descriptions, quantities and the tuned model are left out."""
@@ -328,24 +300,23 @@ class Memory:
         compaction_at: of a compaction checkpoint, whose rows can no longer be retracted. candidates: those for
         exemplars, with their readings, for a compaction checkpoint and for what leaves the journal behind.
         """
-        # The rows after a compaction checkpoint are replayed, and say themselves which of them were retracted.
-        retracted = sorted(self.retracted if compaction_at is None else ())
         compacted = self.compacted if compaction_at is None else compaction_at
-        excluded = sorted(row for row in self.retracted | self.excluded if row <= compacted)
+        gone = np.array(sorted(self.retracted), dtype=np.int64)
         weighed = candidates is None and compaction_at is None
         return encode(
             MemoryFields(
                 statistics=self.statistics.to_fields(),
                 sample=self.sample.to_fields(self.statistics.dimension),
-                kept=None if self.kept is None else self.kept.to_fields(),
-                exemplars=None if self.exemplars is None else self.exemplars.to_fields(candidates),
+                kept=None if self.kept is None else KeptFields.of(self.kept),
+                exemplars=None if self.exemplars is None else ExemplarFields.of(self.exemplars, candidates),
                 targets=self.targets.to_fields(self.statistics.touches) if self.targets else None,
                 tuned=self.tuned,
-                retracted=np.array(retracted, dtype=np.int64),
-                excluded=np.array(excluded, dtype=np.int64),
+                # Rows behind a compaction checkpoint are replayed, and say themselves which of them were retracted.
+                retracted=gone[gone > compacted][: None if compaction_at is None else 0],
+                excluded=gone[gone <= compacted],
                 tuned_last_sequence=self.tuned_last_sequence,
                 descriptions=dict(sorted(self.descriptions.items())),
-                quantities={name: declaration(quantity) for name, quantity in sorted(self.quantities.items())},
+                quantities={name: one.model_dump(exclude={"name"}) for name, one in sorted(self.quantities.items())},
                 corrections=[(row, correction.to_text()) for row, correction in self.corrections.items()],
                 weighings=dict(self.weighings) if weighed else {},
             )
@@ -359,18 +330,18 @@ class Memory:
         """
         made, sensor = MemoryFields.of(held, self.statistics.dimension, path), self.recipe.sensor
         self.sequence = 0 if isinstance(held, Record) else held.last_sequence
-        with refusing(path, *place_of(held)):
+        with refusing(path, held):
             self.statistics = Statistics.of(self.statistics.dimension, self.plan.scales, made.statistics)
             if made.targets is not None:
                 self.targets = TargetSums.of(self.statistics, made.targets)
             self.sample = TouchSample.of(made.sample)
             if self.kept is not None and made.kept is not None:
-                self.kept.fill(made.kept)
+                self.kept.update(made.kept.touches(sensor.channels))
             if self.exemplars is not None and made.exemplars is not None:
-                self.exemplars.fill(made.exemplars, source)
+                self.exemplars.update(made.exemplars.rows(source))
             self.quantities = {name: Quantity(name=name, **fields) for name, fields in made.quantities.items()}
             self.corrections = {row: Correction.from_text(text, sensor) for row, text in made.corrections}
-        self.retracted, self.excluded = set(made.retracted.tolist()), set(made.excluded.tolist())
+        self.retracted = {*made.retracted.tolist(), *made.excluded.tolist()}
         self.descriptions, self.weighings = made.descriptions, made.weighings
         self.take_tuned(made)
         return self
@@ -381,3 +352,15 @@ class Memory:
             self.tuned_last_sequence = made.tuned_last_sequence
             if self.tuned is None or self.tuned.digest() != made.tuned.digest():
                 self.tuned = made.tuned
+
+
+def _refill(sample: Sample[T], heads: Iterable[Head], ready: Iterable[tuple[str, bytes, T]], make: Any) -> None:
+    """Choose among what a sample holds and some observations; ready: items by material and key; make: of a head."""
+    made = {(material, key): item for material, key, item in ready}
+
+    def item(head: Head) -> T:
+        own = made.get((head.label, head.key))
+        # It is annotated otherwise where the touch was retracted in between.
+        return make(head) if own is None else replace(own, annotation=annotation_of(head.attributes))
+
+    sample.refill(((head.label, head.key, head) for head in heads), item)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -43,7 +43,8 @@ class Tuned:
 
     names: the materials it tells apart, C of them. heads: width of windows → float64 (d, C), of features as shares of
     the embedding's bound. bias: (C,). network: tensor name → float32, to be put over the embedding's own; empty
-    where only the head was trained. mode: see TuneMode. kept: whether it answers. report: of how it was made.
+    where only the head was trained. mode: see TuneMode. kept: whether it answers. report: of how it
+    was made, without what differs between two runs that give the same bytes.
     """
 
     names: Annotated[list[Name], Must("", "C")]
@@ -63,8 +64,3 @@ class Tuned:
         for _, tensor in sorted(self.network.items()):
             digest.update(repr(tensor.shape).encode() + tensor.astype("<f4").tobytes())
         return digest.hexdigest()
-
-    @staticmethod
-    def described(report: TuneReport) -> dict[str, Any]:
-        """A report as JSON, without what differs between two runs that give the same bytes."""
-        return {name: value for name, value in asdict(report).items() if name not in ("seconds", "digest")}

@@ -14,19 +14,7 @@ from scroll_tactile_store import Head, Record
 
 from scroll_tactile.errors import InputError, ObservationError, UnknownMaterialError
 from scroll_tactile.memory.state import MOST_CORRECTIONS, Memory
-from scroll_tactile.memory.touch_rows import (
-    ADAPT,
-    DECLARE,
-    MEMBER,
-    MERGE,
-    OBSERVE,
-    RETRACTS,
-    SOURCE,
-    active_rows,
-    annotation_of,
-    declared_by,
-    retracted_by,
-)
+from scroll_tactile.memory.touch_rows import Kind, active_rows, annotation_of, declared_by, retracted_by
 from scroll_tactile.persistence.ram_store import AnyStore
 from scroll_tactile.results import Adaptation, Observation, Receipt
 from scroll_tactile.signals.ranges import CURE
@@ -35,13 +23,13 @@ from scroll_tactile.statistics.annotations import Annotation
 __all__ = [
     "TouchRows",
     "adaptation_of",
-    "compaction_point",
+    "compaction_end",
     "is_from",
     "observation_of",
     "observations",
-    "observations_to_forget",
     "refusal",
     "rows_with",
+    "to_forget",
 ]
 
 TouchRows = dict[str, tuple[int, Annotation]]
@@ -52,7 +40,7 @@ def rows_with(store: AnyStore, memory: Memory, key: bytes) -> TouchRows:
     """The rows of observations that count and have readings with this hash; of each name the first."""
     found: TouchRows = {}
     for head in takewhile(lambda head: head.sequence <= memory.sequence, store.with_key(key)):
-        if head.kind in (OBSERVE, MEMBER) and not memory.is_gone(head.sequence):
+        if head.kind in (Kind.OBSERVE, Kind.MEMBER) and head.sequence not in memory.retracted:
             found.setdefault(head.label, (head.sequence, annotation_of(head.attributes)))
     return found
 
@@ -72,7 +60,7 @@ def refusal(names: Sequence[str], material: str, clipped: bool = False) -> str |
     return f"the memory has this touch already, as {names[0]!r} and not as {material!r}: relabel one of them"
 
 
-def observation_of(store: AnyStore, memory: Memory, receipt: Receipt | int) -> Record:
+def observation_of(store: AnyStore, memory: Memory, receipt: Receipt | Adaptation | int) -> Record:
     """The journal's row of an observation that can be retracted.
 
     Raises ObservationError where there is none, it was retracted before, or compacted.
@@ -88,8 +76,11 @@ def observation_of(store: AnyStore, memory: Memory, receipt: Receipt | int) -> R
             "and their features given up"
         )
     record = store.record(sequence)
-    if record.kind != OBSERVE:
-        raise ObservationError(f"row {sequence} of {store.path} is no observation, but of kind {record.kind!r}")
+    if record.kind != Kind.OBSERVE:
+        raise ObservationError(
+            f"row {sequence} of {store.path} is no observation, and no adaptation that counts, but of kind "
+            f"{record.kind!r}"
+        )
     if isinstance(receipt, Receipt) and (receipt.material, receipt.key) != (record.label, record.key):
         raise ObservationError(
             f"the receipt is of another memory: it says that observation {sequence} is of {receipt.material!r} "
@@ -98,30 +89,23 @@ def observation_of(store: AnyStore, memory: Memory, receipt: Receipt | int) -> R
     return record
 
 
-def adaptation_of(store: AnyStore, memory: Memory, receipt: Receipt | Adaptation | int) -> int | None:
+def adaptation_of(memory: Memory, receipt: Receipt | Adaptation | int) -> int | None:
     """The row of an adaptation that counts; None where the receipt is of anything else.
 
-    Raises ObservationError for an adaptation that was not kept, counts no more, or is one of another memory.
+    Raises ObservationError for an adaptation that counts no more, or is one of another memory.
     """
-    if isinstance(receipt, Adaptation) and receipt.sequence is None:
-        raise ObservationError("this adaptation was not kept: there is nothing to retract")
     sequence = receipt.sequence if isinstance(receipt, Adaptation) else receipt
-    if isinstance(sequence, bool) or not isinstance(sequence, int):
-        return None  # a receipt of an observation, or nothing at all: `observation_of` says what was expected
-    head = next(store.heads(sequence - 1), None) if 1 <= sequence <= store.last else None
-    if head is None or head.sequence != sequence or head.kind != ADAPT or RETRACTS in head.attributes:
-        if isinstance(receipt, Adaptation):
-            raise ObservationError(f"row {sequence} of {store.path} is no adaptation: it is one of another memory")
-        return None
-    if sequence not in memory.corrections:
+    if type(sequence) is int and sequence in memory.corrections:
+        return sequence
+    if isinstance(receipt, Adaptation):
         raise ObservationError(
-            f"row {sequence} of {store.path} is no adaptation that counts: it was retracted already, or "
-            f"{MOST_CORRECTIONS} came after it"
+            f"there is no adaptation that counts in row {sequence}: it was not kept, was retracted already, "
+            f"{MOST_CORRECTIONS} came after it, or it is one of another memory"
         )
-    return sequence
+    return None
 
 
-def observations_to_forget(store: AnyStore, memory: Memory, material: str | None, source: str | None) -> list[int]:
+def to_forget(store: AnyStore, memory: Memory, material: str | None, source: str | None) -> list[int]:
     """The sequences of all observations of a material, or from a source: a file, or all in a folder or address.
 
     Raises UnknownMaterialError for a material never observed, ObservationError where a source has none, and where some
@@ -134,13 +118,13 @@ def observations_to_forget(store: AnyStore, memory: Memory, material: str | None
     mine = [
         head
         for head in active_rows(store.heads())
-        if head.kind != MERGE and (is_from(_source(head), source) if material is None else head.label == material)
+        if head.kind != Kind.MERGE and (is_from(_source(head), source) if material is None else head.label == material)
     ]
     if not mine:
         raise ObservationError(
             f"no observation of {store.path} comes from {source!r}; observations() lists their sources"
         )
-    if gone := [head for head in mine if head.kind == MEMBER or head.sequence <= memory.compacted]:
+    if gone := [head for head in mine if head.kind == Kind.MEMBER or head.sequence <= memory.compacted]:
         what = f"what comes from {source!r}" if material is None else f"{material!r}"
         raise ObservationError(
             f"{what} cannot be forgotten: {len(gone)} of its {len(mine)} observations in {store.path} were compacted, "
@@ -151,7 +135,7 @@ def observations_to_forget(store: AnyStore, memory: Memory, material: str | None
 
 
 def _source(head: Head) -> str | None:
-    return cast("str | None", head.attributes.get(SOURCE))
+    return cast("str | None", head.attributes.get("source"))
 
 
 def is_from(recorded: str | None, source: str | None) -> bool:
@@ -166,11 +150,11 @@ def observations(store: AnyStore) -> list[Observation]:
     """All observations of a journal, in order, and the state of each."""
     heads, compacted = list(store.heads()), store.compacted
     retracted = retracted_by(heads)
-    quantities = {head.label: declared_by(head) for head in heads if head.kind == DECLARE}
+    quantities = {head.label: declared_by(head) for head in heads if head.kind == Kind.DECLARE}
 
     def observation(head: Head) -> Observation:
         annotation = annotation_of(head.attributes)
-        gone = head.sequence <= compacted or head.kind == MEMBER
+        gone = head.sequence <= compacted or head.kind == Kind.MEMBER
         return Observation(
             sequence=head.sequence,
             material=head.label,
@@ -182,15 +166,16 @@ def observations(store: AnyStore) -> list[Observation]:
             labels=dict(annotation.labels),
         )
 
-    return [observation(head) for head in heads if head.kind in (OBSERVE, MEMBER)]
+    return [observation(head) for head in heads if head.kind in (Kind.OBSERVE, Kind.MEMBER)]
 
 
-def compaction_point(store: AnyStore, memory: Memory, keep: int) -> int:
+def compaction_end(store: AnyStore, memory: Memory, keep: int) -> int:
     """The last row to be compacted, so that the newest `keep` observations can still be retracted."""
     if isinstance(keep, bool) or not isinstance(keep, int) or keep < 0:
         raise InputError(f"expected keep as a whole number of 0 or more; came {keep!r}")
-    if keep == 0:
-        return store.last
-    kept = store.heads(memory.compacted, kind=OBSERVE)
-    sequences = [head.sequence for head in kept if head.sequence not in memory.retracted]
-    return memory.compacted if len(sequences) <= keep else sequences[-keep] - 1
+    kept = [
+        head.sequence
+        for head in store.heads(memory.compacted, kind=Kind.OBSERVE)
+        if head.sequence not in memory.retracted
+    ]
+    return [*kept, store.last + 1][-keep - 1] - 1 if len(kept) > keep or not keep else memory.compacted

@@ -15,7 +15,7 @@ import shutil
 from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from scroll_tactile_store import Record, Store, StoreError
 from scroll_tactile_store.exceptions import reported
@@ -26,19 +26,7 @@ from scroll_tactile.errors import MismatchError
 from scroll_tactile.memory.gate import MemoryStore, beside, finish_interrupted
 from scroll_tactile.memory.identity import Identity
 from scroll_tactile.memory.state import Memory
-from scroll_tactile.memory.touch_rows import (
-    ADAPT,
-    DECLARE,
-    DESCRIBE,
-    OBSERVE,
-    RETRACT,
-    SENSE,
-    Codes,
-    Readings,
-    pack_codes,
-    pack_readings,
-    unpack_readings,
-)
+from scroll_tactile.memory.touch_rows import Codes, Kind, Readings, pack_codes, pack_readings, unpack_readings
 from scroll_tactile.persistence.ledger import Ledger
 from scroll_tactile.persistence.replaying import refill
 from scroll_tactile.recipe import Recipe
@@ -46,7 +34,7 @@ from scroll_tactile.recipe import Recipe
 __all__ = ["Reembedding"]
 
 ROWS_TOGETHER = 64  # rows that wait for the disk together
-WITHOUT_READINGS = RETRACT, DESCRIBE, DECLARE, SENSE, ADAPT
+LEARNED = Kind.OBSERVE, Kind.MEMBER, Kind.MERGE  # the first alone may have readings
 
 
 class Reembedding:
@@ -61,7 +49,14 @@ class Reembedding:
 
     def __init__(self, source: Store, recipe: Recipe, encode: Callable[[Readings], tuple[int, Codes]]) -> None:
         identity = Identity.of(recipe)
-        _require_readings(source)
+        bare = [head.sequence for head in source.heads() if head.kind in LEARNED and not head.attributes.get("nbytes")]
+        if source.compacted or bare:
+            what = f"rows 1 to {source.compacted} were compacted"
+            raise MismatchError(
+                f"{source.path} cannot be embedded again, which takes the readings of every observation: "
+                + (what if source.compacted else f"{len(bare)} rows, such as row {bare[0]}, have none")
+                + ". Open it with the embedding that made it, or touch again what it knows"
+            )
         self.recipe = recipe
         self._source, self._encode, self._bare = source, encode, identity.embedding.bare
         folder = beside(source.path, "reembedding")
@@ -85,22 +80,19 @@ class Reembedding:
         while draft.last < self._source.last:
             with made.batch():
                 for record in islice(self._source.records(after=draft.last), ROWS_TOGETHER):
-                    self._carry(record)
+                    made.append(record.kind, record.label, record.key, time=record.time, **self._embedded(record))
                 refill(made.memory, draft)
             progress("embedding", draft.last, self._source.last)
         made.save()  # here, and not when both are exchanged: a full disk stops it before that
 
-    def _carry(self, record: Record) -> None:
+    def _embedded(self, record: Record) -> dict[str, Any]:
         attributes, arrays = dict(record.attributes), dict(record.arrays)
-        codes: Codes | None = None
-        if record.kind == OBSERVE:
-            readings = unpack_readings(record.arrays)
-            assert readings is not None
-            steps, codes = self._encode(readings)
-            attributes |= {"columns": steps, "nbytes": readings.nbytes}
-            arrays = pack_readings(readings) | ({} if self._bare else pack_codes(codes))
-        row: Any = {"attributes": attributes, "arrays": arrays, "time": record.time, "codes": codes}
-        self._made.append(record.kind, record.label, record.key, **row)
+        if record.kind != Kind.OBSERVE:
+            return {"attributes": attributes, "arrays": arrays}
+        readings = cast(Readings, unpack_readings(arrays))
+        steps, codes = self._encode(readings)
+        arrays = pack_readings(readings) | ({} if self._bare else pack_codes(codes))
+        return {"attributes": attributes | {"columns": steps}, "arrays": arrays, "applied": {"codes": codes}}
 
     def put_in_place(self) -> Path:
         """Close both memories and exchange them; returns the folder of the old one.
@@ -132,21 +124,3 @@ class Reembedding:
     def close(self) -> None:
         """Release the files; the copied rows stay, for a run that resumes."""
         self._draft.close()
-
-
-def _require_readings(store: Store) -> None:
-    heads = list(store.heads())
-    brought = [head.sequence for head in heads if head.kind not in WITHOUT_READINGS and head.kind != OBSERVE]
-    bare = [head.sequence for head in heads if head.kind == OBSERVE and "nbytes" not in head.attributes]
-    if store.compacted:
-        what = f"rows 1 to {store.compacted} were compacted, and their readings given up"
-    elif brought:
-        what = f"row {brought[0]} brought in a compacted memory, which had none"
-    elif bare:
-        what = f"{len(bare)} rows, such as {bare[0]}, were observed without keeping them (exemplars=0)"
-    else:
-        return
-    raise MismatchError(
-        f"{store.path} cannot be embedded again, which takes the readings of every observation: {what}. Open it with "
-        "the embedding that made it, or touch again what it knows"
-    )

@@ -8,20 +8,19 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from itertools import takewhile
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from itertools import islice, takewhile
 from typing import Any, cast
 
 import numpy as np
-import numpy.typing as npt
-from scroll_tactile_store import Head, StoreError
+from scroll_tactile_store import Head
 
 from scroll_tactile.errors import InputError, UnknownMaterialError
 from scroll_tactile.health.channel_numbers import MOST_CHANNELS, from_text, has_numbers
 from scroll_tactile.health.skin_fit import Fitted, Reference, fitted, guess_of_lost
 from scroll_tactile.health.watch import WatchedRow, WatchedRows, WatchRules
 from scroll_tactile.memory.state import Memory
-from scroll_tactile.memory.touch_rows import CHANNELS, OBSERVE, RETRACT, SENSE, SOURCE, retracted_by
+from scroll_tactile.memory.touch_rows import Kind, retracted_by
 from scroll_tactile.persistence.ledger import Ledger
 from scroll_tactile.persistence.observations import is_from
 from scroll_tactile.persistence.ram_store import AnyStore
@@ -33,8 +32,6 @@ from scroll_tactile.signals.levels import LEVELS, MISSING
 from scroll_tactile.signals.stream import Stream, validate
 
 __all__ = ["adapt_to", "health_of", "known_touches"]
-
-Floats = npt.NDArray[np.float64]
 
 PIECE = 64  # rows that are read while the memory is locked
 MOST_WATCHED = 4  # rules: of the page, of diagnostics, of a live session
@@ -49,31 +46,19 @@ def health_of(ledger: Ledger, channels: int, rules: WatchRules) -> Health:
     It goes on from the rows that were read last by the same rules. Two threads that ask at once read them both.
     """
     with ledger.lock:
-        ledger.require_open()
         _ = ledger.memory  # which may have lost rows, and says so as it is read
-        watched = ledger.watched.pop(rules, None)
-        if watched is None or watched.lost != ledger.lost:
-            watched = WatchedRows(rules, channels, ledger.lost)
-    try:
-        while piece := _piece(ledger, watched):
-            for row in piece:
-                watched.take(row)
-    except StoreError:  # of a damaged row: those before it need not be read again
-        _keep(ledger, watched)
-        raise
+        kept = ledger.watched
+        watched = kept.pop(rules, None) or WatchedRows(rules, channels)
+    while piece := _piece(ledger, watched):
+        for row in piece:
+            watched.take(row)
     with ledger.lock:
         store = ledger.require_open()
         found = watched.health(lambda row: next((head.time for head in store.heads(row - 1)), None))
-        _keep(ledger, watched)  # from here on another thread may take it further
+        kept[rules] = watched  # from here on another thread may take it further
+        while len(kept) > MOST_WATCHED:
+            del kept[next(iter(kept))]
         return found
-
-
-def _keep(ledger: Ledger, watched: WatchedRows) -> None:
-    """Go on from these rows at the next question by the same rules; those by the last few rules are kept."""
-    with ledger.lock:
-        ledger.watched[watched.rules] = watched
-        while len(ledger.watched) > MOST_WATCHED:
-            del ledger.watched[next(iter(ledger.watched))]
 
 
 def _piece(ledger: Ledger, watched: WatchedRows) -> list[WatchedRow]:
@@ -81,28 +66,25 @@ def _piece(ledger: Ledger, watched: WatchedRows) -> list[WatchedRow]:
     with ledger.lock:
         store, memory, rules = ledger.require_open(), ledger.memory, watched.rules
         if memory.sequence > watched.known:
-            new = [head for head in store.heads(watched.known, kind=RETRACT) if head.sequence <= memory.sequence]
+            new = _heads(store, memory, None, watched.known)
             for gone in sorted(retracted_by(new), reverse=True):
                 watched.take_back(gone)
             watched.known = memory.sequence
-        rows: list[WatchedRow] = []
         if watched.watch.alarmed is not None:
-            return rows
-        for head in _heads(store, memory, rules.until, watched.last):
-            source = cast("str | None", head.attributes.get(SOURCE))
-            counts = head.kind in (OBSERVE, SENSE) and not memory.is_gone(head.sequence)
-            if counts and (rules.source is None or is_from(source, rules.source)):
-                numbers = from_text(head.attributes.get(CHANNELS), watched.watch.channels)
-                rows.append(WatchedRow(head.sequence, head.label, cast(int, head.attributes["columns"]), numbers))
-            else:
-                rows.append(WatchedRow(head.sequence))
-            if len(rows) == PIECE:
-                break
-        return rows
+            return []
+
+        def row(head: Head) -> WatchedRow:
+            source = cast("str | None", head.attributes.get("source"))
+            counts = head.kind in (Kind.OBSERVE, Kind.SENSE) and head.sequence not in memory.retracted
+            if not counts or not (rules.source is None or is_from(source, rules.source)):
+                return WatchedRow(head.sequence)
+            numbers = from_text(head.attributes.get("channels"), watched.watch.channels)
+            return WatchedRow(head.sequence, head.label, cast(int, head.attributes["columns"]), numbers)
+
+        return [row(head) for head in islice(_heads(store, memory, rules.until, watched.last), PIECE)]
 
 
 def _heads(store: AnyStore, memory: Memory, until: int | None, after: int = 0) -> Iterator[Head]:
-    """The rows behind one, as far as the memory knows them; until: the last of them."""
     last = memory.sequence if until is None else min(until, memory.sequence)
     return takewhile(lambda head: head.sequence <= last, store.heads(after))
 
@@ -151,16 +133,28 @@ def adapt_to(
 ) -> Adaptation:
     """As `TactileLearner.adapt`, for touches that `known_touches` gave. unknown_of: how many are called unknown."""
     with ledger.lock:
-        store, memory = ledger.require_write_mode(), ledger.memory
+        store, memory = ledger.require_open(to_write=True), ledger.memory
         if unknown := sorted(set(touches.values()) - set(memory.statistics.materials)):
             raise UnknownMaterialError(f"expected touches of materials that were observed; never were {unknown[:5]}")
         own = {of.key for touch in touches for of in (touch, corrected_stream(touch, memory.correction))}
         out = own if until is None else own | {head.key for head in store.heads(until)}
         kept = [] if memory.kept is None else [each.levels for each in memory.kept.touches() if each.key not in out]
-        reference = _reference(_heads(store, memory, until), memory, sensor.channels, own)
-    _require_known(reference, sorted(set(touches.values())), store)
+        reference = Reference(sensor.channels)
+        for head in _heads(store, memory, until):
+            counts = head.kind == Kind.OBSERVE and head.sequence not in memory.retracted and head.key not in own
+            numbers = from_text(head.attributes.get("channels") if counts else None, sensor.channels)
+            if numbers is not None:
+                reference.take(head.label, numbers)
+        missing = [name for name in sorted(set(touches.values())) if not reference.counts.get(name)]
+        if missing or reference.total - len(reference.counts) < FEWEST_SPREAD:
+            raise InputError(
+                f"the journal of {store.path} has too few numbers of the channels of earlier touches, of "
+                f"{reference.total} of {len(reference.counts)} materials, and none of {missing[:5]}: those by which it "
+                "is to be adapted do not count, nor do those behind `until`, or that came in with a compacted memory. "
+                "Observe more before the skin is changed, or take touches of other materials"
+            )
     at_ends = [((levels == 0) | (levels == LEVELS - 1)).mean(axis=1) for levels in kept]  # of levels (n, T)
-    ends: Floats = np.mean(at_ends, axis=0) if kept else np.ones(sensor.channels)
+    ends = np.asarray(np.mean(at_ends, axis=0) if kept else np.ones(sensor.channels))
     low, high = (np.asarray(limit, np.float64) for limit in sensor.limits)
     shares = [(touch.readings - low) / (high - low) for touch in touches]
     found = fitted(reference, shares, list(touches.values()), ends)
@@ -188,37 +182,8 @@ def adapt_to(
     )
 
 
-def _reference(heads: Iterable[Head], memory: Memory, channels: int, own: set[bytes]) -> Reference:
-    """What some rows say of touches, without those by which the memory is to be adapted."""
-    reference = Reference(channels)
-    for head in heads:
-        if head.kind == OBSERVE and not memory.is_gone(head.sequence) and head.key not in own:
-            numbers = from_text(head.attributes.get(CHANNELS), channels)
-            if numbers is not None:
-                reference.take(head.label, numbers)
-    return reference
-
-
-def _require_known(reference: Reference, materials: Sequence[str], store: AnyStore) -> None:
-    """Raise InputError where the rows do not say how touches of these materials read, and how touches differ."""
-    if missing := [name for name in materials if not reference.counts.get(name)]:
-        raise InputError(
-            f"the journal of {store.path} has no numbers of the channels of earlier touches of {missing[:5]}: they are "
-            "those by which it is to be adapted, lie behind `until`, or came in with a compacted memory. Take touches "
-            "of other materials"
-        )
-    if reference.total - len(reference.counts) < FEWEST_SPREAD:
-        raise InputError(
-            f"the journal of {store.path} has {reference.total} touches of {len(reference.counts)} materials, too few "
-            "to know how touches of one material differ: observe more before the skin is changed"
-        )
-
-
 def _refusal(
-    found: Fitted,
-    touches: Mapping[Stream, str],
-    correction: Correction,
-    unknown_of: Callable[[Iterable[Stream]], int],
+    found: Fitted, touches: Mapping[Stream, str], correction: Correction, unknown_of: Callable[[Iterable[Stream]], int]
 ) -> str:
     """Why a correction is not kept; "" where it is: most of its touches are known with it, or more than without."""
     if found.gained < LIKELIER:

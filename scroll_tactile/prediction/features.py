@@ -10,7 +10,6 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.embeddings import protocol
-from scroll_tactile.memory.identity import FingerprintCheck
 from scroll_tactile.memory.touch_rows import Codes
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.contact import Rest, image_of, pressed
@@ -82,13 +81,13 @@ class WindowCache:
 class FeatureExtractor:
     """Makes features of touches, by a sensor, an embedding and a plan of windows; it learns nothing.
 
-    check: of the embedding's fingerprint, if the embedding was made from the memory's configuration.
+    check: raises EmbeddingMismatchError where an embedding is not the one that made the memory; it is called once.
 
     Raises InputError for an embedding of frames with a sensor that is no camera, or a resting image of another shape.
     """
 
     def __init__(
-        self, sensor: Sensor, embedding: protocol.Embedding, plan: WindowPlan, check: FingerprintCheck | None = None
+        self, sensor: Sensor, embedding: protocol.Embedding, plan: WindowPlan, check: Callable[..., None] | None = None
     ) -> None:
         self.sensor, self.embedding, self._plan, self.check = sensor, embedding, plan, check
         protocol.require_rest(embedding, sensor)
@@ -97,7 +96,8 @@ class FeatureExtractor:
     def verified(self) -> FeatureExtractor:
         """This extractor, whose embedding is the memory's. Raises EmbeddingMismatchError."""
         if self.check is not None:
-            self.check.require(self.embedding)
+            self.check(self.embedding)
+            self.check = None
         return self
 
     def stream(self, readings: Readings) -> Stream:

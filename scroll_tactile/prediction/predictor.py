@@ -26,8 +26,8 @@ from scroll_tactile.embeddings.protocol import Embedding, capabilities_of
 from scroll_tactile.embeddings.registry import configuration_of
 from scroll_tactile.errors import AnnotationError, InputError
 from scroll_tactile.memory.descriptions import require_constituents
-from scroll_tactile.memory.gate import MemoryStore, finish_interrupted, open_memory, sound_rows
-from scroll_tactile.memory.identity import FingerprintCheck, Identity
+from scroll_tactile.memory.gate import MemoryStore, finish_interrupted, open_memory
+from scroll_tactile.memory.identity import Identity
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import Codes
 from scroll_tactile.memory.tuned import Tuned
@@ -97,7 +97,7 @@ class Predictor:
         self._version = -1  # of the memory up to which changes are noted
         self._worker: ThreadPoolExecutor | None = None
         self._process = os.getpid()
-        self._composer: tuple[Model, int, int, Composer] | None = None
+        self._composer: tuple[Model, int, Composer] | None = None
         self._estimator: Estimator | None = None
 
     @classmethod
@@ -112,7 +112,7 @@ class Predictor:
         """Of the memory in a folder. Raises as `TactileLearner.open`."""
         store, identity, recipe = open_memory(path, request, mode)
         try:
-            check = FingerprintCheck(identity, store.path) if request.embedding is None else None
+            check = partial(identity.require_embedding, store.path) if request.embedding is None else None
             return cls._of(recipe, _extractor(recipe, check), store, identity.embedding.configuration is not None)
         except BaseException:
             store.close()
@@ -121,8 +121,7 @@ class Predictor:
     @classmethod
     def of_snapshot(cls, state: Mapping[str, Any]) -> Self:
         """Of the memory that `snapshot` described, in memory only."""
-        recipe: Recipe = state["recipe"]
-        return cls._of(recipe, _extractor(recipe, state["check"]), state["store"])
+        return cls._of(state["recipe"], _extractor(state["recipe"], state["check"]), state["store"])
 
     @classmethod
     def _of(cls, recipe: Recipe, extractor: FeatureExtractor, store: AnyStore, known: bool | None = None) -> Self:
@@ -139,8 +138,9 @@ class Predictor:
         """All that the memory knows at this moment, to be pickled; its touches are compacted there."""
         with self.ledger.lock:
             store, memory = self.ledger.store, self.ledger.memory
-            kept = memory.to_arrays(memory.sequence, exemplar_candidates(memory, store))
-            held = RamStore.compacted_to(self.recipe, sound_rows(store.heads, logger.warning), memory.sequence, kept)
+            arrays, attributes = memory.to_arrays(memory.sequence, exemplar_candidates(memory, store))
+            held = RamStore(self.recipe, store.heads())
+            held.compact(arrays, last_sequence=memory.sequence, attributes=attributes)
             return {"store": held, "recipe": self.recipe, "check": self.extractor.check}
 
     def of_axis(self, axis: str) -> Predictor:
@@ -332,10 +332,9 @@ class Predictor:
         model = self.present()
         if not model.knows_sample:
             model = self._settled()
-        state = model, self.ledger.version, self.ledger.described
-        if self._composer is None or self._composer[:3] != state:
-            self._composer = *state, Composer.of(model, self.ledger.memory)
-        return self._composer[3]
+        if self._composer is None or self._composer[:2] != (model, self.ledger.version):
+            self._composer = model, self.ledger.version, Composer.of(model, self.ledger.memory)
+        return self._composer[2]
 
     def close(self) -> None:
         """As `TactileLearner.close`."""
@@ -421,7 +420,7 @@ def _reembedding(store: Store, embedding: Embedding | None) -> Reembedding:
     return Reembedding(store, recipe, lambda readings: extractor.learned(Stream(recipe.sensor, readings)))
 
 
-def _extractor(recipe: Recipe, check: FingerprintCheck | None = None) -> FeatureExtractor:
+def _extractor(recipe: Recipe, check: Callable[..., None] | None = None) -> FeatureExtractor:
     return FeatureExtractor(recipe.sensor, recipe.embedding, recipe.plan, check)
 
 

@@ -19,9 +19,9 @@ from scroll_tactile.recordings.bounds import require_file
 from scroll_tactile.recordings.delimited import LONGEST
 from scroll_tactile.recordings.headings import Heading, Noted
 from scroll_tactile.recordings.paths import nearest
-from scroll_tactile.recordings.recording import Episode, Recording
+from scroll_tactile.recordings.recording import Episode, Recording, longest_step
 
-__all__ = ["Interval", "Touch", "declared_quantities", "read_intervals", "touches"]
+__all__ = ["Interval", "Touch", "declared_quantities", "read_intervals", "require_found", "touches"]
 
 _MOST, _LONGEST_NAMES = 1 << 25, 1 << 16  # characters of a table of intervals, which are a million; and of its names
 
@@ -66,7 +66,7 @@ class Touch:
 
 
 Cut = Literal["whole", "episodes"] | Sequence[Interval] | Callable[[Recording], Iterable[tuple[int, int]]]
-Label = Literal["topic", "file", "folder", "task"] | None
+Label = str | None
 
 
 def touches(recording: Recording, cut: Cut = "whole", label: Label = None) -> tuple[Touch, ...]:
@@ -79,7 +79,8 @@ def touches(recording: Recording, cut: Cut = "whole", label: Label = None) -> tu
         name but that of all its episodes, where they have the same.
 
     Raises InputError for a recording without episodes, without the requested label or with an empty one, for intervals
-    of which none is of this file or which lie outside it, and for spans that a function gives outside the recording.
+    of which none is of this file, which lie outside it, or overlap and name two materials, and for spans that a
+    function gives outside the recording.
     """
     intervals: Sequence[Interval] = ()
     if isinstance(cut, str):
@@ -156,17 +157,30 @@ def _of_intervals(recording: Recording, mine: Sequence[Interval], intervals: Seq
             f"{recording.source}: time goes back, so that intervals have no place: give another clock=",
             argument="clock",
         )
-    first = float(times[0]) if len(times) else 0.0
-    spans = []
+    first, last = (float(times[0]), float(times[-1])) if len(times) else (0.0, 0.0)
+    slack = longest_step(float(np.median(np.diff(times))) if len(times) > 1 else 0.0)  # tables round
+    spans: list[Episode] = []
     for interval in mine:
         start = first if first > 1e6 and interval.end < 1e6 else 0.0
         begin, end = np.searchsorted(times, [interval.begin + start, interval.end + start]).tolist()
-        if end <= begin:
+        outside = interval.begin + start < first - slack or interval.end + start > last + slack
+        if end <= begin or outside:
+            lies = "lies outside" if end > begin else "holds no reading of"
             raise InputError(
-                f"row {interval.row} of the intervals, {interval.begin:g} to {interval.end:g} s, holds no reading of "
-                f"{recording.source}, which lasts from {times[0] - start:g} to {times[-1] - start:g} s"
+                f"row {interval.row} of the intervals, {interval.begin:g} to {interval.end:g} s, {lies} "
+                f"{recording.source}, which lasts from {first - start:g} to {last - start:g} s"
             )
         spans.append(Episode(begin, end, interval.material))
+    pairs = sorted(zip(spans, mine, strict=True), key=lambda pair: pair[0].begin)
+    latest = pairs[0]
+    for span, interval in pairs[1:]:
+        if span.begin < latest[0].end and interval.material != latest[1].material:
+            raise InputError(
+                f"rows {latest[1].row} and {interval.row} of the intervals overlap in {recording.source}, and name two "
+                f"materials: {latest[1].material!r} until {latest[1].end:g} s, {interval.material!r} from "
+                f"{interval.begin:g} s"
+            )
+        latest = max(latest, (span, interval), key=lambda pair: pair[0].end)
     return tuple(spans)
 
 
@@ -178,23 +192,50 @@ def _same(file: str, source: str) -> bool:
     return alike and parts[-1] in (place.name, place.stem)
 
 
-def read_intervals(path: str | PathLike[str], files: Iterable[str | PathLike[str]] | None = None) -> list[Interval]:
+def require_found(intervals: Iterable[Interval], files: Sequence[str]) -> None:
+    """Raise InputError for an interval whose file is none of these, or fits several of them."""
+    called: dict[str, list[str]] = {}  # by name, with and without the suffix; each pair would be too many
+    for file in files:
+        place = _place(file)
+        for name in {place.name, place.stem}:
+            called.setdefault(name, []).append(file)
+    for interval in intervals:
+        name = PurePosixPath(interval.file.replace("\\", "/")).name
+        fitting = [file for file in called.get(name, ()) if _same(interval.file, file)]
+        if len(fitting) == 1:
+            continue
+        where = f"row {interval.row} of the intervals: {interval.file!r}"
+        if not fitting:
+            raise InputError(f"{where} is none of the recordings{nearest(interval.file, files)}")
+        parts = _place(fitting[0]).parts
+        longer = ("/".join(parts[-count:]) for count in range(2, len(parts)))
+        alone = next((text for text in longer if not any(_same(text, other) for other in fitting[1:])), fitting[0])
+        listed = ", ".join(fitting[:5]) + (f" and {len(fitting) - 5} more" if len(fitting) > 5 else "")
+        raise InputError(f"{where} fits {len(fitting)} recordings, {listed}: write more of its path, such as {alone}")
+
+
+def read_intervals(path: str | PathLike[str]) -> list[Interval]:
     """The intervals in a table with the columns file, begin, end and material (or label), in any order.
 
     A column with brackets is noted of each touch that has something there: values under "force [N]", of a quantity that
     the memory has in this unit, or under "force [N] 0..10 step 0.01", which `declared_quantities` has; labels on the
     axis slip under "slip [label]". Other columns are passed over.
 
-    files: the recordings they are meant for; with them, a row of a file that is not among these is refused.
-
     Raises FieldError for a column that is missing, or there twice; RecordingError for a table that cannot be read;
-    InputError for a row whose times are no numbers or end before they begin, whose material is empty, whose file is not
-    there, or that has a value which is no number.
+    InputError for a row whose times are no numbers or end before they begin, whose material is empty, that has
+    more cells than the table has columns, or a value which is no number.
     """
     names, headings, table = _table(path)
-    sources = None if files is None else [fspath(file) for file in files]
-    rows = ((row, dict(zip(names, cells, strict=False))) for row, cells in table)
-    return [_interval(f"{path}, row {row}", row, cells, headings, sources) for row, cells in rows]
+    found = []
+    for row, cells in table:
+        where = f"{path}, row {row}"
+        if beyond := [cell for cell in cells[len(names) :] if cell.strip()]:
+            raise InputError(
+                f"{where}: expected {len(names)} cells, {', '.join(names)}; came {len(cells)}, the last "
+                f"{beyond[-1]!r:.60}. A cell with a comma in it stands in quotation marks"
+            )
+        found.append(_interval(where, row, dict(zip(names, cells, strict=False)), headings))
+    return found
 
 
 def declared_quantities(path: str | PathLike[str]) -> list[Quantity]:
@@ -241,9 +282,7 @@ def _lines(path: str | PathLike[str], file: TextIO) -> Iterator[str]:
         longest = LONGEST
 
 
-def _interval(
-    where: str, row: int, cells: dict[str, str], headings: dict[str, Heading], files: list[str] | None
-) -> Interval:
+def _interval(where: str, row: int, cells: dict[str, str], headings: dict[str, Heading]) -> Interval:
     file, material = cells.get("file", "").strip(), cells.get("material", "").strip()
     if not file or not material:
         raise InputError(f"{where}: expected a file and a material; came {file!r} and {material!r}")
@@ -253,8 +292,6 @@ def _interval(
         raise InputError(f"{where}: expected begin and end in seconds: {error}") from error
     if not (math.isfinite(begin) and math.isfinite(end) and begin < end):
         raise InputError(f"{where}: expected begin before end; came {begin:g} and {end:g}")
-    if files is not None and not any(_same(file, source) for source in files):
-        raise InputError(f"{where}: {file!r} is none of the recordings{nearest(file, files)}")
     noted = _noted(where, cells, headings)
     return Interval(
         file=file, begin=begin, end=end, material=material, row=row, values=noted.values, labels=noted.labels

@@ -101,13 +101,13 @@ class Sample(Generic[T]):
             for key in self._keys[material]:
                 yield material, key, self._items[material, key]
 
-    def items(self) -> Iterator[T]:
-        """The items alone."""
-        return (item for *_, item in self)
+    def touches(self) -> list[T]:
+        """The items alone, by material and key."""
+        return [item for *_, item in self]
 
     def named(self) -> tuple[list[str], list[Annotation], Bytes]:
         """The fields of `TouchFields`."""
-        noted = [getattr(item, "annotation", NO_ANNOTATION) for item in self.items()]
+        noted = [getattr(item, "annotation", NO_ANNOTATION) for item in self.touches()]
         keys = key_rows([key for _, key, _ in self])
         return [material for material, *_ in self], noted if any(noted) else [], keys
 
@@ -188,7 +188,7 @@ class TouchSample(Sample[SampledTouch]):
 
     def to_fields(self, dimension: int) -> SampleFields:
         """What a store keeps of it."""
-        touches = list(self.items())
+        touches = self.touches()
         pairs = np.concatenate([np.zeros((0, 3), np.int64), *(touch.pairs for touch in touches)])
         rows = np.concatenate([np.zeros((0, dimension), np.int32), *(touch.rows for touch in touches)])
         sizes = np.array([len(touch.pairs) for touch in touches], dtype=np.int64)

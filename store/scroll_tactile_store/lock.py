@@ -57,8 +57,10 @@ class WriterLock:
     def _note_holder(self) -> None:
         since = datetime.now(UTC).isoformat(timespec="seconds")
         text = json.dumps({"pid": os.getpid(), "host": socket.gethostname(), "since": since})
-        with new_file(self._folder / HOLDER_FILE, "w") as file:
+        draft = self._folder / f"{HOLDER_FILE}.new"
+        with new_file(draft, "w") as file:
             file.write(text + "\n")
+        draft.replace(self._folder / HOLDER_FILE)
 
     def _refusal(self) -> str:
         try:

@@ -25,7 +25,6 @@ from faults.model import Operation, Pairs, State, Touch
 from scroll_tactile import Kernels, Quantity, TactileLearner
 from scroll_tactile.errors import InputError, MismatchError
 from scroll_tactile.memory.touch_rows import annotated
-from scroll_tactile.persistence.merge import MergeRules
 from scroll_tactile.statistics.annotations import Annotation
 from scroll_tactile.statistics.fields import encode
 
@@ -140,8 +139,7 @@ def _merge(
     learner: TactileLearner, home: Path, name: str, descriptions: Any = "same", of_sources: bool = False
 ) -> list[int]:
     if of_sources:
-        rules = MergeRules(one_name=True, descriptions=descriptions)
-        merged, refused = learner._ledger.merge(home / name, rules, lambda *_: None)
+        merged, refused = learner._ledger.merge(home / name, lambda *_: None, choice=descriptions, one_name=True)
     else:
         merged, refused = learner.merge(home / name, descriptions=descriptions), []
     return [merged.observations, merged.shared, merged.described, len(refused)]
@@ -179,7 +177,7 @@ def samples(learner: TactileLearner) -> dict[str, Any]:
     pool = hashlib.sha256()
     for name, key, touch in memory.sample:
         pool.update(repr((name, key, touch.rows.tobytes(), touch.pairs.tobytes(), touch.annotation)).encode())
-    arrays, told = ({}, None) if memory.kept is None else encode(memory.kept.to_fields())
+    arrays, told = ({}, None) if memory.kept is None else encode(scroll_tactile.memory.state.KeptFields.of(memory.kept))
     kept = hashlib.sha256(repr(told).encode())
     for name in sorted(arrays):
         kept.update(repr((name, arrays[name].shape)).encode() + arrays[name].tobytes())

@@ -17,8 +17,8 @@ from scroll_tactile_store.store import Store
 
 from faults.planting import BUGS, Replacement, bug, nothing
 from scroll_tactile.memory.state import Memory
-from scroll_tactile.memory.touch_rows import MEMBER, MERGE, OBSERVE
-from scroll_tactile.persistence import ledger, merge, packing, replaying
+from scroll_tactile.memory.touch_rows import Kind
+from scroll_tactile.persistence import ledger, merge, replaying
 
 
 @bug("a frame's payload is not verified", log.Log, "_payload")
@@ -159,10 +159,9 @@ def _kept_not_retracted(chosen: Any, memory: Any, given: Any, last_sequence: int
     return fresh
 
 
-@bug("a retraction is lost in a merge", merge, "active_rows")
-@bug("a retraction is lost in packing", packing, "active_rows")
+@bug("a retraction is lost in a merge or in packing", merge, "active_rows")
 def _retracted_rows_too(_: Any, heads: Any) -> Any:
-    return [head for head in heads if head.kind in (OBSERVE, MERGE, MEMBER)]
+    return [head for head in heads if head.kind in (Kind.OBSERVE, Kind.MERGE, Kind.MEMBER)]
 
 
 @bug("a shared touch is counted twice", merge.Merge, "_there")
@@ -170,9 +169,9 @@ def _nothing_there(*_: Any) -> Any:
     return set(), []
 
 
-@bug("a packed memory is counted twice", merge, "sums_without")
-def _nothing_left_out(sums: Any, source: Any, newest: Any, memory: Any, left_out: Any) -> Any:
-    return sums(source, newest, memory, set())
+@bug("a packed memory is counted twice", merge.Merge, "_summed")
+def _nothing_left_out(_: Any, self: Any, whole: Any) -> Any:
+    return whole
 
 
 @bug("a description is lost in a merge", merge.Merge, "_chosen_descriptions")

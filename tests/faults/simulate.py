@@ -55,7 +55,7 @@ WEIGHTS = {
     "quiet": 3,
 }
 QUICK_SEEDS = 6
-QUICK_PLANTS = ("the log is not synced", "a retraction is lost in a merge")
+QUICK_PLANTS = ("the log is not synced", "a retraction is lost in a merge or in packing")
 MISFITS = ("AttributeError", "NameError", "TypeError")  # of a bug that is put in where nothing is
 SHORTENINGS = 400
 Event = tuple[str, int]

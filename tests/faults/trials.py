@@ -125,7 +125,7 @@ class Attempt:
             self.learner = opened(path)
         if operation[0] == "close":
             # Opening replayed all rows: nothing would be written.
-            self.learner._ledger._saved = -1
+            self.learner.memory.saved = -1
 
     @property
     def changes_nothing(self) -> bool:

@@ -15,7 +15,7 @@ from scroll_tactile import Kernels, Sensor, TactileLearner
 from scroll_tactile.matching.conformal import Conformal
 from scroll_tactile.matching.kept_arrays import KeptArrays, KeptTouch
 from scroll_tactile.memory.state import Memory
-from scroll_tactile.memory.touch_rows import DESCRIBE, RETRACT, unspanned
+from scroll_tactile.memory.touch_rows import Kind, unspanned
 from scroll_tactile.results import Prediction
 from scroll_tactile.signals.stream import Stream
 
@@ -43,9 +43,9 @@ def learned_of(names: Sequence[str], counts: Array, sums: Array) -> dict[str, tu
 
 def as_row(head: Any) -> Row:
     """A row of a journal as a `State` has it; a touch is its key."""
-    if head.kind == RETRACT:
+    if head.kind == Kind.RETRACT:
         return "retract", tuple(unspanned(head.attributes["sequences"])), head.label
-    if head.kind == DESCRIBE:
+    if head.kind == Kind.DESCRIBE:
         said = head.attributes.get("constituents")
         return "describe", head.label, None if said is None else tuple(said.items())
     return "observe", head.label, head.key
@@ -112,7 +112,7 @@ class Truth:
 
     def typical(self, row: int, names: Sequence[str], streams: Sequence[Stream]) -> tuple[float, ...]:
         """How typical touches of one thing are of some materials."""
-        kept_touches = Memory(self._learner._predictor.recipe).kept
+        kept_touches = Memory(self._learner._predictor.recipe)
         if row not in self._conformal:
             kept = [
                 KeptTouch(name, key, kept_touches.levels(self.stream(key).readings))

@@ -1,6 +1,8 @@
 """Many files are learned, gone on with and evaluated; what is wrong in one file costs no other."""
 
+import re
 import shutil
+from functools import partial
 from pathlib import Path
 
 import h5py
@@ -14,6 +16,7 @@ from touches import PAD, SETTINGS, require_same, stream
 from examples.paper.readers import biotac_slide
 from scroll_tactile import Kernels, TactileLearner, sensors
 from scroll_tactile.clients.learning import learning
+from scroll_tactile.clients.learning.fleet import learn
 from scroll_tactile.clients.learning.learning import evaluate_sources, learn_sources
 from scroll_tactile.clients.learning.sources import Refused, SourceOptions, find_sources, source_touches
 from scroll_tactile.errors import FieldError, InputError, MaterialError
@@ -87,6 +90,7 @@ class TestSources:
         [
             ({"material": "a", "by": "file"}, InputError, "in one way"),
             ({"material": ""}, MaterialError, "1 to 200"),
+            ({"by": "folder:x"}, InputError, "or 'folder:2'; came 'folder:x'"),
             ({"preset": "biotacc"}, InputError, "expected a preset"),
             ({"columns": "25-44"}, FieldError, "such as 25:44 or 0,3,5:9, counted from 0; came '25-44'"),
             ({"cut": "intervals"}, InputError, "takes intervals=, a table"),
@@ -230,21 +234,60 @@ class TestLearn:
         require_same(learner, [("a", (i, 60)) for i in range(5)])
 
     def test_intervals_name_and_cut(self, tmp_path, learner):
-        whole = np.concatenate([stream((0, 60)), stream((1, 60))])
-        times = np.arange(120)[:, None] / 50
+        whole = np.concatenate([stream((0, 60)), stream((1, 60)), stream((2, 60))[:1]])
+        times = np.arange(121)[:, None] / 50
         header = "time,x,y"
         np.savetxt(
             tmp_path / "t.csv", np.hstack([times, whole]), delimiter=",", header=header, comments="", fmt="%.17g"
         )
         intervals = (
             Interval("t.csv", -0.01, 1.19, "a"),
-            Interval("t.csv", 1.19, 3, "b"),
-            Interval("t.csv", 0, 0.01, "c"),
+            Interval("t.csv", 1.19, 2.39, "b"),
+            Interval("t.csv", 2.39, 2.5, "c"),
         )
         done = learn_sources(learner, [str(tmp_path / "t.csv")], SourceOptions(intervals=intervals))
         assert done.learned == {"a": 1, "b": 1}
-        assert [each.source for each in done.refused] == [f"{tmp_path}/t.csv[0:1]"]
+        assert [each.source for each in done.refused] == [f"{tmp_path}/t.csv[120:121]"]
         require_same(learner, [("a", (0, 60)), ("b", (1, 60))])
+
+    @pytest.mark.parametrize(
+        ("files", "typed", "by", "names"),
+        [
+            (["felt/1.csv", "oak/1.csv"], ["."], "folder", {"felt": 1, "oak": 1}),
+            (["felt/1/t.csv", "oak/1/t.csv"], ["."], "folder:1", {"felt": 1, "oak": 1}),
+            (["felt/1/t.csv", "oak/1/t.csv"], ["felt/1/t.csv", "oak/1/t.csv"], "folder:7", {"felt": 1, "oak": 1}),
+            (["a/felt/t.csv", "b/felt/u.csv"], ["a", "b"], "folder", {"felt": 2}),
+            (["a/felt/t.csv", "b/felt/u.csv"], ["."], "folder:2", {"felt": 2}),
+            (["felt/t.csv"], ["felt"], "folder:1", {"felt": 1}),
+            (
+                ["felt/1/t.csv", "oak/2/t.csv"],
+                ["."],
+                "folder",
+                "'1' is a number.*folder:1' for felt, oak; .*:2' for 1, 2",
+            ),
+            (["7/t.csv"], ["7"], "folder", "'7' is a number"),
+            (["a/felt/t.csv", "b/felt/u.csv"], ["."], "folder", "'felt' lies in several.*folder:2' for felt"),
+            (["felt/t.csv"], ["."], "folder:2", "it has no folder 2; expected by='folder:1', felt"),
+        ],
+    )
+    def test_folders_name_materials_where_they_are_names(self, tmp_path, files, typed, by, names):
+        for number, name in enumerate(files):
+            (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+            np.savetxt(tmp_path / name, stream((number, 60)), delimiter=",", fmt="%.17g")
+        levels = len(tmp_path.parts) - 1
+        by = by.replace("7", str(levels + 1))  # of a file that was typed, its path counts
+        learn_them = partial(
+            learn, [tmp_path / each for each in typed], tmp_path / "m", SourceOptions(by=by), sensor=PAD
+        )
+        if isinstance(names, dict):
+            assert learn_them(workers=1).learned == names
+            return
+        try:
+            said = learn_them(workers=1).refused[0].why
+        except InputError as error:
+            said = str(error)
+        assert re.search(names, said), said
+        assert not (tmp_path / "m").exists()
 
     def test_a_column_names_what_is_touched_from_then_on(self, tmp_path, learner):
         rows = [*stream((0, 60)).tolist(), *stream((1, 60)).tolist()]

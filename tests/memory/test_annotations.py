@@ -1,25 +1,26 @@
-"""Values and labels of touches: kept with their row, exact, and refused where they cannot be."""
+"""Values and labels of touches, and what materials are made of: kept with their rows, or refused."""
 
 import math
 
 import pytest
 from scroll_tactile_store import Store
-from touches import OBSERVED, SETTINGS, filled, stream
+from touches import OBSERVED, SETTINGS, filled, require_same, spoil, stream
 
 from scroll_tactile import Quantity, TactileLearner
-from scroll_tactile.errors import AnnotationError, InputError, MismatchError
-from scroll_tactile.memory.touch_rows import DECLARE
+from scroll_tactile.clients.learning.plain_export import export_plain
+from scroll_tactile.errors import AnnotationError, DescriptionError, InputError, MismatchError
 from scroll_tactile.statistics.annotations import Annotation
 
 FORCE = Quantity(name="force", unit="N", low=-1, high=10, resolution=0.01)
 SPEED = Quantity(name="speed", unit="m/s", low=0, high=1, resolution=0.001)
-NOTED = (
-    [  # of each touch in `OBSERVED`: values and labels
-        ({"force": i / 3} if i % 3 else {}) | ({"speed": 0.25} if i == 4 else {}) for i in range(len(OBSERVED))
-    ],
-    [{"slip": "ns"[i % 2]} if i % 4 else {} for i in range(len(OBSERVED))],
-)
-ALL = [*zip(OBSERVED, *NOTED, strict=True)]
+ALL = [  # touches with values and labels
+    (
+        pair,
+        ({"force": i / 3} if i % 3 else {}) | ({"speed": 0.25} if i == 4 else {}),
+        {"slip": "ns"[i % 2]} if i % 4 else {},
+    )
+    for i, pair in enumerate(OBSERVED)
+]
 
 
 def feel(learner, noted=ALL, **how):
@@ -104,40 +105,27 @@ def test_a_merge_brings_them_and_a_retraction_takes_them_out(tmp_path, whole, ke
 
 
 def test_where_there_are_none_a_memory_is_the_one_that_it_was(tmp_path):
-    """The same rows, arrays and digest, and not a byte more; a quantity that no touch carries changes no digest."""
-    plain, _ = filled(tmp_path / "plain")
-    declared, _ = filled(tmp_path / "declared")
-    declared.declare(FORCE)
-    assert plain.digest() == declared.digest() == plain.memory.statistics.digest()
-    for learner in (plain, declared):
-        learner.close()
-    with Store.open(tmp_path / "plain", mode="read") as store:
+    """Not a byte more is written; a quantity that no touch carries changes no digest."""
+    with filled(tmp_path / "m")[0] as plain:
+        plain.declare(FORCE)
+        assert plain.digest() == plain.memory.statistics.digest()
+    with Store.open(tmp_path / "m", mode="read") as store:
         assert not {"values", "labels"} & {name for head in store.heads() for name in head.attributes}
         point = store.latest()
-        assert not [name for name in (*point.arrays, *point.attributes) if "quant" in name or "axis" in name]
-        assert not [name for name in point.attributes if "target" in name or "annot" in name]
-    with Store.open(tmp_path / "declared", mode="read") as store:
-        assert [head.kind for head in store.heads()].count(DECLARE) == 1
+        assert not [name for name in (*point.arrays, *point.attributes) if "target" in name or "axis" in name]
 
 
 def test_an_axis_that_every_touch_has_keeps_no_second_moments_of_its_own(tmp_path):
-    def own():
+    for extra in (0, 1):
+        with opened(tmp_path / "m") as learner:
+            feel(learner, [(pair, {}, {"slip": pair[0]}) for pair in OBSERVED])
+            assert learner.memory.targets.axes["slip"] == learner.memory.statistics
+            if extra:
+                learner.observe("a", stream((9, 60)))
+            assert learner.axes["slip"] == {"a": 4, "b": 4, "c": 4}
         with Store.open(tmp_path / "m", mode="read") as store:
             moments = tuple(f"targets-axes-0-statistics-{what}" for what in ("second", "codes"))
-            return [name for name in store.latest().arrays if name.startswith(moments)]
-
-    with opened(tmp_path / "m") as learner:
-        feel(learner, [(pair, {}, {"slip": pair[0]}) for pair in OBSERVED])
-    assert not own()
-    with opened(tmp_path / "m") as learner:
-        assert learner.memory.targets.axes["slip"] == learner.memory.statistics
-        receipt = learner.observe("a", stream((9, 60)))
-        assert learner.axes["slip"] == {"a": 4, "b": 4, "c": 4}
-    assert own()
-    with opened(tmp_path / "m") as learner:
-        learner.retract(receipt)
-        assert learner.memory.targets.axes["slip"] == learner.memory.statistics
-    assert not own()
+            assert any(name.startswith(moments) for name in store.latest().arrays) == bool(extra)
 
 
 def test_the_same_quantity_again_is_no_row_and_another_is_refused(tmp_path):
@@ -171,7 +159,7 @@ def test_the_same_quantity_again_is_no_row_and_another_is_refused(tmp_path):
         ({"values": [("force", 1.0)]}, "values as a mapping by name; came list"),
         ({"labels": {"slip": ""}}, "axes and labels as materials' names are: expected a name of 1 to 200"),
         ({"labels": {"slip": 3}}, "came int 3"),
-        ({"labels": {"a\n": "x"}}, "printable"),
+        ({"labels": {"a\nb": "x"}}, "printable"),
         ({"labels": {str(i): "x" for i in range(17)}}, "at most 16 axes; came 17"),
         ({"labels": {str(i): "x" for i in range(16)}}, "at most 16 axes; came .*'slip'"),
         ({"values": {"force": 2.5}}, r"observation 4 has this touch of 'b' with values \{'force': 0.33\} and labels"),
@@ -206,10 +194,10 @@ def test_one_that_is_observed_again_after_its_retraction_has_what_is_noted_then(
     learner.retract(learner.observe(name, stream(touch), values=values))
     for each in (learner, expected):
         each.observe(name, stream(touch), values=other, labels={"slip": "n"})
-    assert told(learner) == told(expected)
+    before = told(learner)
     learner._ledger.store.close()  # as if the power failed: all rows are replayed
     with opened(tmp_path / "m") as again:
-        assert told(again) == told(expected)
+        assert told(again) == before == told(expected)
 
 
 def test_a_merge_of_another_unit_or_value_changes_nothing(tmp_path):
@@ -223,3 +211,86 @@ def test_a_merge_of_another_unit_or_value_changes_nothing(tmp_path):
         with pytest.raises(MismatchError, match=r"row 4 of .* has this touch of 'b' with .*; row 3 comes with"):
             ours.merge(third)
         assert (told(ours), ours._ledger.store.last) == before
+
+
+HARD = {"hardness": [62.0, "Shore A"]}
+SAID = {
+    "a": {"silk": 0.25, "wool": 0.75, **HARD},
+    "b": {"silk": 1.0},
+    "d": {"soft": True, "wool": 0.5, "jute": None},
+}
+
+
+def described(path, felt=OBSERVED, said=SAID):
+    learner, receipts = filled(path, felt)
+    for name, one in said.items():
+        learner.describe(name, one)
+    return learner, receipts
+
+
+def test_a_compaction_checkpoint_that_all_is_begun_from_again_has_what_was_said_until_then(path):
+    learner, _ = described(path)
+    learner.compact(keep=4)  # what was said comes behind it
+    learner.describe("a", None)
+    store = learner._ledger.store
+    learner._ledger._write_checkpoint()
+    compaction = store.compaction().number
+    store.close()  # as if the power failed
+    for folder in (path / "checkpoints").iterdir():
+        if int(folder.name) != compaction:
+            spoil(path, int(folder.name))
+    with TactileLearner.open(path, **SETTINGS) as again:
+        assert again.memory.checkpoint == compaction
+        require_same(again, OBSERVED, {name: one for name, one in SAID.items() if name != "a"})
+
+
+def test_of_two_descriptions_one_has_to_be_chosen(path, tmp_path):
+    other = SAID | {"a": {"wool": 1.0}}
+    ours, _ = described(path, OBSERVED[:6])
+    theirs, _ = described(tmp_path / "other", OBSERVED[6:], other)
+    with ours, theirs:
+        with pytest.raises(MismatchError, match=r"such as 'a': here it is .* there \{'wool': 1.0\}"):
+            ours.merge(theirs)
+        with pytest.raises(InputError, match="'same', 'ours' or 'theirs'"):
+            ours.merge(theirs, descriptions="both")
+        require_same(ours, OBSERVED[:6], SAID)
+        ours.merge(theirs, descriptions="ours")
+        require_same(ours, OBSERVED, SAID)
+        assert ours.merge(theirs, descriptions="theirs").described == 1
+        require_same(ours, OBSERVED, other)
+
+
+def test_it_is_written_out_plain(path, tmp_path):
+    with described(path)[0] as learner:
+        export_plain(learner, tmp_path / "plain")
+    rows = (tmp_path / "plain" / "descriptions.csv").read_text(encoding="utf-8").split()
+    assert rows[0] == "material,constituent,present,share"
+    assert rows[1:4] == ["a,silk,yes,0.25", "a,wool,yes,0.75", "b,silk,yes,1.0"]
+    assert rows[4:] == ["d,jute,unknown,", "d,soft,yes,", "d,wool,yes,0.5"]
+    properties = (tmp_path / "plain" / "properties.csv").read_text(encoding="utf-8")
+    assert properties.split() == ["material,property,value,unit", "a,hardness,62.0,Shore", "A"]
+
+
+def test_a_property_has_a_value_and_one_unit_for_all_materials(path, tmp_path):
+    with described(path, [], {"a": {"hardness": (62, "Shore A")}})[0] as learner:
+        assert learner.descriptions == {"a": HARD}
+        for wrong, match in (
+            ({"hardness": (3.5, "MPa")}, "'b', 'hardness': expected it in Shore A, as of 'a'; came 3.5 MPa"),
+            ({"hardness": (float("nan"), "Shore A")}, "the value finite"),
+            ({"hardness": (62,)}, "a property as"),
+            ({"hardness": ("62", "Shore A")}, "a property as"),
+            ({"hardness": (62, "")}, "1 to 40 printable"),
+        ):
+            with pytest.raises(DescriptionError, match=match):
+                learner.describe("b", wrong)
+        with pytest.raises(DescriptionError, match="nothing was described yet"):
+            learner.compose(stream((7, 25)))  # a property is no constituent
+        other, _ = described(tmp_path / "other", [], {"b": {"hardness": (3.5, "MPa")}})
+        with other, pytest.raises(MismatchError, match=r"expected it in Shore A, as of 'a'; came 3\.5 MPa"):
+            learner.merge(other)
+        learner.describe("a", {"hardness": (6.2, "MPa")})  # the only one may change its unit
+        assert learner.descriptions == {"a": {"hardness": [6.2, "MPa"]}}
+        rows = learner._ledger.store.last
+        for share, more in ((1.0, 1), (1, 1), (True, 2)):  # the same again is no row, and one is not true
+            learner.describe("b", {"silk": share})
+            assert (learner._ledger.store.last, learner.descriptions["b"]) == (rows + more, {"silk": share})

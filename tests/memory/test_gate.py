@@ -4,7 +4,6 @@ Nobody is asked whether a stranger's numbers fit each other; what their files ma
 tests/test_strangers.py.
 """
 
-import math
 import shutil
 from functools import partial
 
@@ -14,9 +13,8 @@ from forging import (
     checkpoint_of,
     get_identity,
     observation,
-    put_arrays,
+    put_checkpoint,
     put_row,
-    seal,
     set_configuration,
     set_identity,
 )
@@ -24,7 +22,6 @@ from scroll_tactile_store import DamageError, StoreError
 from touches import PAD, filled, held, stream
 
 from scroll_tactile import Quantity, TactileLearner
-from scroll_tactile.clients.learning.plain_export import export_plain
 from scroll_tactile.errors import EmbeddingError, MismatchError, ScrollTactileError
 from scroll_tactile.memory.gate import check_memory
 from scroll_tactile.memory.touch_rows import pack_readings
@@ -62,8 +59,7 @@ def path(made, tmp_path):
     return shutil.copytree(made / "whole", tmp_path / "m")
 
 
-def opened(path, **settings_):
-    return TactileLearner.open(path, **settings_)
+opened = TactileLearner.open
 
 
 def row(payload=None, **changes):
@@ -77,15 +73,12 @@ def said(**changes):
 
 
 def checkpoint(change):
-    """Another checkpoint where the newest lies; change: of its attributes and arrays, of which None goes."""
+    """Another newest checkpoint; change: of its attributes and arrays, of which None goes."""
 
     def put(path):
         attributes, arrays = checkpoint_of(path)
-        before = dict(arrays)
         change(attributes, arrays)
-        changed = {name: one for name, one in arrays.items() if one is not None and one is not before.get(name)}
-        known = put_arrays(path, 1, changed, gone=[name for name, one in arrays.items() if one is None])
-        seal(path, 1, known | {"attributes": attributes})
+        put_checkpoint(path, attributes, {name: one for name, one in arrays.items() if one is not None})
 
     return put
 
@@ -94,91 +87,59 @@ def spoilt(name, change):
     return checkpoint(lambda _, arrays: arrays.update({name: change(arrays[name])}))
 
 
-def identified(field, value, part=""):
-    def put(path):
-        known = get_identity(path)
-        (known[part] if part else known)[field] = value
-        set_identity(path, known)
-
-    return put
+def identified(field, value):
+    return lambda path: set_identity(path, get_identity(path) | {field: value})
 
 
-def table(make, values_by_name):
+def table(make, values_of):
     """What is done, by name, for each of several values of each name."""
-    return {
-        f"{name} {i}": make(name, value) for name, values in values_by_name.items() for i, value in enumerate(values)
-    }
+    return {f"{name} {i}": make(name, value) for name, values in values_of.items() for i, value in enumerate(values)}
 
 
 ROWS = {
     "no attributes": row(attributes={}),
-    "columns of others": said(columns=59),
-    "bytes in words": said(nbytes="a"),
-    "bytes of others": said(nbytes=488),
     "bytes of none": row({}),
     "another shape": row({"readings-2e0": np.zeros(3, np.int8)}),
     "not finite": row(pack_readings(np.full((60, 2), np.nan, np.float32))),
     "out of range": row(pack_readings(np.full((60, 2), 1.5, np.float32))),
     "another touch's key": row(key=validate(stream(OTHER[0][1]), PAD).key),
-    "a short key": row(key=b"abc"),
     "no name": row(label=""),
-    "a long name": row(label="x" * 10**6),
     "an escape for a name": row(label="\x1b]0;pwned\x07\x1b[2J"),
     "an escape for a source": said(source="\x1b[2J"),
     "a large shape": row(PACKED | {"readings-shape": np.array([2**40, 2])}),
-    "few zeros": row(PACKED | {"readings-zero": np.full(14, 255, np.uint8)}),
     "no rest": row({name: one for name, one in PACKED.items() if name != "readings-rest"}),
     **table(lambda name, value: said(**{name: value}), {"values": [[], {"force": 1.5}], "labels": [[], {"slip": 3}]}),
 }
-SPANS = [None, "x", [[1]], [[1, 10**12]], [[1, 99]], [[0, 1]], [[2, 1]], [[3, 4], [1, 2]]]
+SPANS = ["x", [[1]], [[1, 10**12]], [[1, 10**12], [10**12, 1]]]
 ROWS |= {f"retracts {one}": row({}, kind="retract", label="", key=b"", attributes={"sequences": one}) for one in SPANS}
-ROWS |= {
-    f"describes {one}": row({}, kind="describe", label="a", key=b"", attributes={"constituents": one})
-    for one in ("x", [], {"wool": "x"}, {"wool": 2.0}, {"": 1.0})
-}
-ROWS |= {
-    f"declares {label!r} {one}"[:60]: row({}, kind="declare", label=label, key=b"", attributes=QUANTITY | one)
-    for label, one in [
-        ("", {}),
-        ("\x1b[2J", {}),
-        *(("speed", one) for one in ({"unit": 3}, {"low": 1.0}, {"low": "x"})),
-    ]
-}
 CHECKPOINTS = table(
     spoilt,
     {
         "statistics-observations": [lambda a: a.astype(float), lambda a: a[:-1]],
-        "statistics-sums-15": [lambda a: a[:, :-1], lambda a: a.astype(np.int32), lambda _: None],
-        "statistics-codes-15": [lambda a: a[:-1]],
+        "statistics-sums-15": [lambda a: a[:, :-1], lambda _: None],
         "sample-keys": [lambda a: a[:, :3]],
-        "sample-rows": [lambda a: a[:, :-1], lambda a: a.astype(np.int64)],
         "kept-levels": [lambda a: a.astype(np.int16)],
-        "exemplars-sources": [lambda a: a.astype(float)],
         "targets-axes-0-statistics-sums-15": [lambda a: a[:, :-1], lambda _: None],
     },
 ) | table(
     lambda name, value: checkpoint(lambda attributes, _: attributes.update({name: value})),
     {
         "statistics": [None, {"materials": ["a", "b", "\n"]}, {"materials": ["a"]}],
-        "sample": [None, {"materials": ["a"], "annotations": []}],
-        "descriptions": [[], {"a": {"wool": "x"}}],
+        "descriptions": [[]],
         "quantities": [[], {"force": 3}],
         "targets": [{}],
-        "weighings": [[]],
         "tuned": [{}],
     },
 )
 IDENTITIES = table(
     identified,
     {"sensor": ["x", {"name": "pad"}], "embedding": [{}], "grid": [{}, {"bits": True, "scales": [15]}]}
-    | {"exemplars": [-1, 10**30], "kept_touches": [True], "views": [1], "reading": [None]},
-) | table(
-    partial(identified, part="sensor"), {"channels": [-1, 10**400], "rate": [None], "low": [1e308], "layout": [[1e308]]}
+    | {"exemplars": [-1], "kept_touches": [True], "views": [1], "reading": [None]},
 )
 FORGED = {
     "row [0-9]+ of .* is not what is written there": ROWS,
-    "checkpoint 1 of .* is not what is written there": CHECKPOINTS,
-    "identity|range": IDENTITIES,
+    "checkpoint 2 of .* is not what is written there": CHECKPOINTS,
+    "the identity of .* is not what is written there": IDENTITIES,
 }
 CASES = [pytest.param(do, match, id=name) for match, cases in FORGED.items() for name, do in cases.items()]
 
@@ -205,50 +166,31 @@ def test_a_sound_memory_has_nothing_that_is_found_and_a_forged_row_that_fits_is_
         assert learner.materials["silk"] == 1
 
 
-@pytest.mark.parametrize(
-    ("do", "said"),
-    [
-        (row({}, kind="exec", label="", key=b""), "of kind 'exec'"),
-        (row(pack_readings(TOUCH.readings) | {"dreams": np.zeros(3)}), r"arrays \['dreams'\], which this version"),
-    ],
-)
-def test_what_a_later_version_writes_is_told_from_damage(path, do, said):
-    do(path)
-    with pytest.raises(MismatchError, match=said):
+def test_a_row_of_a_later_version_is_told_from_damage(path):
+    row({}, kind="exec", label="", key=b"")(path)
+    with pytest.raises(MismatchError, match=r"of kind 'exec'.*newer"):
         opened(path)
 
 
 def test_what_is_left_out_as_shared_must_be_there(path, tmp_path):
     """Row 1 lies under a checkpoint: opening does not read it, but a touch is left out for its key."""
     theirs, (receipt,) = filled(tmp_path / "theirs", [("a", (9, 60))])
-    theirs.close()
     attributes, payload = observation(path)
     put_row(path, sequence=1, label="a", key=receipt.key, attributes=attributes, payload=payload)
     assert any("content hash" in found for found in check_memory(path))
-    with opened(tmp_path / "theirs") as learner:
+    with theirs as learner:
         before = held(learner)
         with pytest.raises(DamageError, match=f"row 1 of {path} .* content hash"):
             learner.merge(path)
         assert held(learner) == before
 
 
-def test_a_time_beyond_the_calendar_is_exported(path, tmp_path):
-    for time in (-1e14, 1e300):
-        touch = validate(stream((int(abs(math.log(abs(time)))), 60)), PAD)
-        row(pack_readings(touch.readings), key=touch.key, time=time)(path)
-    with opened(path, mode="read") as learner:
-        assert [row.time for row in learner.observations()][-2:] == [-1e14, 1e300]
-        export_plain(learner, tmp_path / "plain")
-    assert "-100000000000000.0" in (tmp_path / "plain" / "observations.csv").read_text()
-
-
 def test_what_a_compaction_checkpoint_brings_is_a_row_that_is_looked_at(made, tmp_path):
     other = shutil.copytree(made / "other", tmp_path / "other")
     with opened(other) as target:
         target.merge(made / "compacted")
+        assert target.materials == {"a": 4, "b": 4, "c": 4, "d": 2, "e": 1}
     assert check_memory(other) == []
-    with opened(other, mode="read") as learner:
-        assert learner.materials == {"a": 4, "b": 4, "c": 4, "d": 2, "e": 1}
     attributes, arrays = checkpoint_of(made / "compacted")
     put_row(other, kind="merge", attributes=attributes | {"descriptions": 1}, payload=arrays)
     with pytest.raises(DamageError, match="is not what is written there"):

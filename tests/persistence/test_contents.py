@@ -4,8 +4,7 @@ import copy
 import pickle
 
 import pytest
-from forging import spoil_row
-from scroll_tactile_store import StoreClosedError, StoreError, StoreFullError
+from scroll_tactile_store import StoreError, StoreFullError
 from scroll_tactile_store.log import Log
 from touches import SETTINGS, fed, filled, held, stream
 
@@ -55,32 +54,9 @@ class TestOneContent:
         other.retract(later)
         assert held(other) == before == held(learner)
 
-    def test_of_a_closed_folder_there_is_no_snapshot(self, tmp_path):
-        learner, _ = filled(tmp_path / "m", OBSERVED, exemplars=0)
-        learner.close()
-        with pytest.raises(StoreClosedError):
-            copy.deepcopy(learner)
-
-    def test_a_repeated_receipt_equals_the_first(self, learner):
-        readings = stream((90, 60))  # some are outside the range
-        with learner.batch():
-            first = learner.observe("a", readings)
-        for same in (readings, readings.clip(0, 1)):
-            again = learner.observe("a", same)
-            assert again.repeated and again == first and hash(again) == hash(first)
-        assert (first.clipped > 0, again.clipped) == (True, 0)
-
 
 class TestChanges:
     """What is there is what was observed and not retracted, whatever was done in between."""
-
-    def test_what_was_taken_back_and_compacted_is_learned_again(self, tmp_path):
-        learner, receipts = filled(tmp_path / "m", OBSERVED)
-        learner.retract(receipts[8])
-        with learner:
-            assert learner.compact(keep=3).last_sequence == 9  # the row that was retracted is the last of them
-            assert learner.names_of(stream(OBSERVED[8][1])) == []
-            assert not learner.observe(*given(OBSERVED[8])).repeated
 
     def test_a_batch_that_is_lost_has_nothing_there(self, tmp_path, monkeypatch):
         learner, _ = filled(tmp_path / "m", OBSERVED[:4])
@@ -97,13 +73,6 @@ class TestChanges:
                     learner.observe(*given(OBSERVED[6]))
             monkeypatch.undo()
             assert not learner.observe(*given(OBSERVED[5])).repeated
-
-    def test_damaged_rows_keep_nothing_from_being_learned(self, tmp_path):
-        filled(tmp_path / "m", OBSERVED)[0].close()
-        spoil_row(tmp_path / "m", 4, head=True)
-        with TactileLearner.open(tmp_path / "m") as learner:
-            assert not learner.observe("d", stream((70, 60))).repeated
-            assert learner.observe(*given(OBSERVED[4])).repeated
 
 
 class TestRelabel:

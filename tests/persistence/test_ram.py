@@ -55,22 +55,23 @@ def test_it_is_packed_and_merged_as_one_with_a_path(tmp_path):
     assert learner.merge(learner).shared == 11
 
 
-def test_a_merge_that_is_cut_short_never_began(tmp_path):
-    learner, other = fed(OBSERVED[:4]), fed(OBSERVED[4:])
+def test_a_merge_that_is_cut_short_never_began_and_rows_behind_a_checkpoint_alone_are_embedded_again(monkeypatch):
+    monkeypatch.setattr("scroll_tactile.persistence.ledger.CHECKPOINT_EVERY", 3)
+    learner, other, embedded = fed(OBSERVED[:4]), fed(OBSERVED[4:]), []
     with pytest.raises(KeyboardInterrupt):
         learner.merge(other, progress=lambda what, done, of: done < 3 or interrupt())
+    empty, encode = learner._ledger._empty, learner._ledger._empty.encode
+    monkeypatch.setattr(empty, "encode", lambda readings: embedded.append(len(readings)) or encode(readings))
+    assert learner.memory.sequence == 4 and len(embedded) == 1
     assert held(learner) == held(fed(OBSERVED[:4])) and len(learner.observations()) == 4
 
 
-def test_an_f_star_outlives_a_change_that_was_cut_short(monkeypatch):
-    learner = fed(OBSERVED[:6])
-    digest = learner.fine_tune(epochs=1).digest
-    with monkeypatch.context() as patched:
-        patched.setattr(learner._ledger, "_changed", interrupt)
-        with pytest.raises(KeyboardInterrupt):
-            learner.retract(receipt := learner.observations()[0].sequence)
-    assert learner.tuned_digest() is None and receipt == 1  # the row was there
-    assert learner.fine_tune(epochs=1).digest != digest
+def test_one_that_a_compacted_one_came_into_is_merged_as_any():
+    learner, between, ours = fed(OBSERVED[:4]), fed(OBSERVED[4:8]), fed(OBSERVED[8:])
+    learner.compact()
+    between.merge(learner)
+    assert ours.merge(between).observations == 8
+    assert held(ours) == held(fed(OBSERVED))
 
 
 def test_what_takes_a_folder_is_refused(tmp_path):

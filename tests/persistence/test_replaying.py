@@ -7,7 +7,7 @@ import pytest
 from commands import run
 from forging import spoil_row
 from scroll_tactile_store import DamageError, Store
-from touches import OBSERVED, PAD, SMALL, OwnKernels, fed, held, stream, without
+from touches import OBSERVED, PAD, SMALL, OwnKernels, fed, filled, held, stream, without
 
 from examples.paper.transfer.maps import Maps
 from scroll_tactile import Joined, TactileLearner
@@ -118,15 +118,6 @@ def test_a_reader_takes_an_f_star_where_it_is_another_one(tmp_path):
             assert reader.tuned_digest() is writer.tuned_digest() is None
 
 
-def test_rows_hold_readings_alone_where_the_memory_can_embed_them_again(made, tmp_path):
-    with TactileLearner.open(tmp_path / "m", **made) as learner:
-        observe(learner, OBSERVED[:1])
-    with Store.open(tmp_path / "m", mode="read") as store:
-        kinds = {name.partition("-")[0] for name in store.record(1).arrays}
-    bare = made["embedding"] is SMALL
-    assert kinds == ({"readings"} if bare else {"codes"} | ({"readings"} if made["exemplars"] else set()))
-
-
 @pytest.mark.parametrize("made", ["kernels", "maps, no exemplars"], indirect=True)
 def test_a_memory_that_was_killed_is_inspected_without_its_embedding(made, tmp_path):
     learner = TactileLearner.open(tmp_path / "m", **made)
@@ -146,3 +137,17 @@ def test_a_checkpoint_is_written_each_so_many_rows(made, tmp_path, monkeypatch):
         assert held(learner) == fresh(made, OBSERVED)
     with Store.open(tmp_path / "m", mode="read") as store:
         assert not any(name.startswith("exemplars-held") for name in store.latest().arrays)
+
+
+def test_a_checkpoint_that_takes_the_place_of_one_has_its_weighing(tmp_path):
+    learner, _ = filled(tmp_path / "m")
+    with learner:
+        learner.settle()
+    for compacting in (False, True, False):
+        with TactileLearner.open(tmp_path / "m") as learner:
+            weighings = dict(learner.memory.weighings)
+            assert weighings
+            if compacting:
+                learner.compact()
+    with TactileLearner.open(tmp_path / "m", mode="read") as learner:
+        assert learner.memory.weighings == weighings

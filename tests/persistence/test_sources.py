@@ -1,8 +1,7 @@
 """Where a touch comes from is kept beside it, and changes nothing of what was learned; a wrong name is put right."""
 
 import pytest
-from scroll_tactile_store import Store, StoreFullError
-from touches import OBSERVED, SETTINGS, fed, filled, held, require_same, stream, without
+from touches import OBSERVED, SETTINGS, filled, require_same, stream, without
 
 from scroll_tactile import TactileLearner
 from scroll_tactile.errors import InputError, MaterialError, ObservationError
@@ -31,31 +30,12 @@ class TestSource:
                 kept = [(material, state, source) for _, material, state, source in sources(third)]
                 assert kept == [("a", "compacted", expected[0][3]), ("b", "compacted", None)]
 
-    def test_nothing_that_is_learned_depends_on_it(self, path, tmp_path):
-        with TactileLearner.open(path, **SETTINGS) as learner:
-            for i, (material, touch) in enumerate(OBSERVED):
-                learner.observe(material, stream(touch), source=f"{i}.npy")
-            require_same(learner, OBSERVED)
-        filled(tmp_path / "without")[0].close()
-        with Store.open(path, mode="read") as named, Store.open(tmp_path / "without", mode="read") as plain:
-            for row, other in zip(named.records(), plain.records(), strict=True):
-                assert {**row.attributes} == {**other.attributes, "source": f"{row.sequence - 1}.npy"}
-                assert {name: array.tobytes() for name, array in row.arrays.items()} == {
-                    name: array.tobytes() for name, array in other.arrays.items()
-                }
-
     @pytest.mark.parametrize("wrong", ["", "x" * 1001, "a\x1b[2J", "\ud800", 7, b"a", ["a"]])
     def test_what_is_none_is_refused_and_nothing_kept(self, path, wrong):
         with TactileLearner.open(path, **SETTINGS) as learner:
             with pytest.raises(InputError, match="source"):
                 learner.observe("a", stream((0, 60)), source=wrong)
             assert learner.observations() == []
-
-    def test_a_memory_without_a_path_takes_and_forgets_it(self):
-        learner = TactileLearner(**SETTINGS)
-        learner.observe("a", stream((0, 60)), source="x.npy")
-        assert learner.digest() == fed([("a", (0, 60))]).digest()
-        assert sources(learner) == [(1, "a", "kept", "x.npy")] and learner.forget(source="x.npy") == 1
 
 
 class TestRelabel:
@@ -86,25 +66,3 @@ class TestRelabel:
             learner.compact()
             with pytest.raises(ObservationError, match="were compacted, and their features given up"):
                 learner.relabel(1, "b")
-
-    @pytest.mark.parametrize("failing", [1, 2])
-    def test_it_is_one_change(self, path, monkeypatch, failing):
-        learner, _ = filled(path)
-        append, calls = Store.append, []
-
-        def full(self, *words, **options):
-            calls.append(1)
-            if len(calls) == failing:
-                raise StoreFullError("no space left")
-            return append(self, *words, **options)
-
-        with learner:
-            before = held(learner)
-            monkeypatch.setattr(Store, "append", full)
-            with pytest.raises(StoreFullError):
-                learner.relabel(2, "d")
-            monkeypatch.undo()
-            assert held(learner) == before
-            require_same(learner, OBSERVED)
-        with TactileLearner.open(path) as again:
-            require_same(again, OBSERVED)

@@ -20,6 +20,7 @@ from scroll_tactile.recordings import (
     touches,
 )
 from scroll_tactile.recordings.delimited import LONGEST
+from scroll_tactile.recordings.touches import require_found
 
 
 def recording(source="/data/felt/run.1.mcap", start=0.0, episodes=(), count=100, topic="/rh/denim"):
@@ -80,6 +81,14 @@ def test_intervals_cut_by_the_clock_or_from_the_first_reading(start):
         ({}, "whole", "colour", "'colour'"),
         ({}, [Interval("run.2.mcap", 0, 1, "felt")], None, "no interval is of .*nearest is 'run.2.mcap'"),
         ({}, [Interval("run.1.mcap", 20, 30, "felt", 4)], None, "row 4 .* holds no reading .* lasts from 0 to 9.9 s"),
+        ({}, [Interval("run.1.mcap", 2, 30, "felt", 4)], None, "row 4 .* lies outside .* lasts from 0 to 9.9 s"),
+        ({}, [Interval("run.1.mcap", -1, 3, "felt", 4)], None, "row 4 .* lies outside .* lasts from 0 to 9.9 s"),
+        (
+            {},
+            [Interval("run.1", 6, 7, "oak", 2), Interval("run.1", 1, 9, "felt", 3), Interval("run.1", 2, 3, "felt", 4)],
+            None,
+            "rows 3 and 2 .* overlap .* 'felt' until 9 s, 'oak' from 6 s",
+        ),
         ({"times": np.full(100, np.nan)}, [Interval("run.1", 0, 1, "a")], None, "no clock"),
         ({"times": np.arange(100.0)[::-1]}, [Interval("run.1", 0, 1, "a")], None, "time goes back"),
         ({}, lambda r: [(5, 5)], None, "a cut gave readings 5 to 5 of 100"),
@@ -94,7 +103,7 @@ def test_what_cannot_be_cut_or_named(change, cut, label, message):
 def test_a_table_of_intervals(tmp_path):
     path = tmp_path / "labels.csv"
     path.write_text("\ufeffend;Label;file;begin\n2.5; felt ;a.bag;1\n\n9;cork;b/c.bag;8\n", encoding="utf-8")
-    assert read_intervals(path, ["x/a.bag", "/data/b/c.bag"]) == [
+    assert read_intervals(path) == [
         Interval("a.bag", 1, 2.5, "felt", 2),
         Interval("b/c.bag", 8, 9, "cork", 4),
     ]
@@ -109,13 +118,35 @@ def test_a_table_of_intervals(tmp_path):
         ("file,begin,end,material\na.bag,1\n", InputError, "row 2: expected a file and a material"),
         ("file,begin,end,material\na.bag,1,x,felt\n", InputError, "row 2: expected begin and end in seconds"),
         ("file,begin,end,material\na.bag,3,2,felt\n", InputError, "row 2: expected begin before end"),
-        ("file,begin,end,material\nb.bag,1,2,felt\n", InputError, r"row 2: 'b.bag' is none of the recordings.*a.bag"),
+        (
+            "file,begin,end,material\na.bag,1,2,felt,wool\n",
+            InputError,
+            "row 2: expected 4 cells.*came 5, the last 'wool'",
+        ),
     ]:
         path.write_text(text)
         with pytest.raises(error, match=message):
-            read_intervals(path, ["a.bag"])
+            read_intervals(path)
     with pytest.raises(InputError, match="cannot be read"):
         read_intervals(tmp_path / "none.csv")
+
+
+@pytest.mark.parametrize(
+    ("file", "message"),
+    [
+        ("b.bag", "row 7 .*'b.bag' is none of the recordings.*felt/0.bag"),
+        ("0.bag", r"row 7 .*'0.bag' fits 2 recordings, rec/felt/0.bag, rec/oak/0.bag: write .* such as felt/0.bag"),
+        ("felt/0", None),
+        ("rec\\\\oak\\\\0.bag", None),
+    ],
+)
+def test_an_interval_is_of_one_recording(file, message):
+    files, intervals = ["rec/felt/0.bag", "rec/oak/0.bag", "rec/oak/1.bag"], [Interval(file, 0, 1, "felt", 7)]
+    if message is None:
+        require_found(intervals, files)
+        return
+    with pytest.raises(InputError, match=message):
+        require_found(intervals, files)
 
 
 @pytest.mark.parametrize("make", [os.mkfifo, Path.mkdir])

@@ -7,7 +7,7 @@ import json
 import math
 import struct
 import sys
-from dataclasses import dataclass
+from collections import namedtuple
 from hashlib import blake2b, sha256
 from pathlib import Path
 
@@ -29,34 +29,13 @@ class Damaged(Exception):
         self.number, self.offset = number, offset
 
 
-@dataclass
-class Frame:
-    offset: int
-    mark: bytes
-    identity: bytes
-    number: int
-    batch: int
-    kind: int
-    size: int
-    previous: bytes
-    digest: bytes
-    checksum: bytes
-
+class Frame(namedtuple("Frame", "offset mark identity number batch kind size previous digest checksum")):
     @property
     def end(self):
         return self.offset + HEAD.size + self.size
 
 
-@dataclass
-class Row:
-    sequence: int
-    time: float
-    key: bytes
-    kind: str
-    label: str
-    attributes: dict
-    arrays: bytes | None
-    size: int
+Row = namedtuple("Row", "sequence time key kind label attributes arrays size")
 
 
 def digest(data):

@@ -1,14 +1,13 @@
 """Stores to be harmed, how to harm them, and what they must hold; shared by the tests of this folder."""
 
+import errno
+import os
 import shutil
-import tracemalloc
-from contextlib import contextmanager
 
 import numpy as np
 import pytest
 from forging import frames_of, get_current, group_of, log_of, read_log, spoil_row, write_log
-from scroll_tactile_store import CompactedError, Store, check_store
-from scroll_tactile_store.rows import row_sequence
+from scroll_tactile_store import CompactedError, DamageError, Store, check_store
 
 LAST = 20
 IDENTITY = {"for": ["tests", 1]}
@@ -69,6 +68,19 @@ def compaction(path):
     return group_of(path, get_current(path)["compaction"]["number"])
 
 
+def sequences(rows):
+    return [row.sequence for row in rows]
+
+
+def fails(code=errno.EIO):
+    """A call that the disk refuses."""
+
+    def fail(*_, **__):
+        raise OSError(code, os.strerror(code))
+
+    return fail
+
+
 def flip(file, place=-9, bit=2):
     data = bytearray(file.read_bytes())
     data[place] ^= 1 << bit
@@ -87,7 +99,7 @@ def flip_row(path, number, *, arrays=False):
 
 def change_rows(path, change):
     """Change the bytes of the rows, a dictionary by sequence; all checksums are right."""
-    found = {row_sequence(row): row for row in read_log(path)[1]}
+    found = {int.from_bytes(row[:8], "little"): row for row in read_log(path)[1]}
     change(found)
     write_log(path, list(found.values()))
 
@@ -99,8 +111,7 @@ def lose_rows(path, *numbers):
 
 def cut_rows(path, first):
     """Cut the log off before a row."""
-    file = log_of(path)
-    file.write_bytes(file.read_bytes()[: frames_of(path)[first].offset])
+    os.truncate(log_of(path), frames_of(path)[first].offset)
 
 
 def in_turns(table):
@@ -108,19 +119,16 @@ def in_turns(table):
     return [(bool(i % 2), *(one if isinstance(one, tuple) else (one,))) for i, one in enumerate(table.values())]
 
 
-@contextmanager
-def taking_at_most(size):
-    """What is done in the block must take no more bytes of memory than this."""
-    tracemalloc.start()
-    try:
-        yield
-        assert tracemalloc.get_traced_memory()[1] < size
-    finally:
-        tracemalloc.stop()
-
-
 def damage(path):
     return [problem for problem in check_store(path) if problem.kind != "leftover"]
+
+
+def is_refused(path, match="repair", **options):
+    """Nobody opens it, and each is told why; the last error."""
+    for mode in ("read", "write"):
+        with pytest.raises(DamageError, match=match) as caught:
+            Store.open(path, mode=mode, **options)
+    return caught.value
 
 
 def same_arrays(found, given):

@@ -1,19 +1,17 @@
 """Compaction: a checkpoint stands for rows that have given up their arrays, in a log that takes the other's place.
 
-`tests/faults/each_call.py` has every call of it fail.
+`tests/faults/each_call.py` has every call of it fail; test_store_threads.py has it happen beside every reader.
 """
 
-import errno
+import os
 from pathlib import Path
 
 import pytest
-import scroll_tactile_store.backup
 import scroll_tactile_store.log
 import scroll_tactile_store.store
-from forging import log_of
-from scroll_tactile_store import CompactedError, DamageError, Store
-from scroll_tactile_store.layout import read_current
-from store_builds import LAST, add, commit, damage, flip, flip_row, folders, holds, spoil, state
+from forging import get_current, log_of
+from scroll_tactile_store import CompactedError, DamageError, Store, StoreError
+from store_builds import LAST, add, commit, damage, fails, flip, flip_row, folders, holds, sequences, spoil, state
 
 
 def compact(opened, last_sequence):
@@ -32,7 +30,9 @@ def open_files():
     return len(list(Path("/proc/self/fd").iterdir()))
 
 
-def test_the_space_is_given_back_to_the_disk(opened):
+@pytest.mark.parametrize("together", [4096, 7])
+def test_the_space_is_given_back_to_the_disk(opened, monkeypatch, together):
+    monkeypatch.setattr(scroll_tactile_store.log, "TOGETHER", together)  # rows of a batch
     before = log_of(opened.path).stat().st_size
     commit(opened.compact, LAST)
     opened.close()
@@ -40,6 +40,8 @@ def test_the_space_is_given_back_to_the_disk(opened):
     assert log_of(opened.path).stat().st_size < LAST * 300 < before
     assert folders(opened.path) == ["00000003"]
     assert sorted(entry.name for entry in opened.path.iterdir()) == ["CURRENT", "checkpoints", "lock", "log-00000002"]
+    with Store.open(opened.path, mode="read") as reader:
+        assert holds(reader, compacted=LAST, latest=LAST)
 
 
 @pytest.mark.parametrize("last_sequence", [5, LAST])
@@ -69,14 +71,17 @@ def test_a_damaged_row_keeps_all_from_being_given_up(opened, row, arrays):
             assert holds(again, compacted=7, latest=LAST)
 
 
-@pytest.mark.parametrize("name", ["create_log", "write_checkpoint"])
-def test_what_was_written_is_read_back_before_it_counts(opened, monkeypatch, name):
+@pytest.mark.parametrize("harm", ["a bit of the log", "the end of the log", "a bit of a checkpoint"])
+def test_what_was_written_is_read_back_before_it_counts(opened, monkeypatch, harm):
+    name = "create_log" if "log" in harm else "write_checkpoint"
     real = getattr(scroll_tactile_store.store, name)
 
     def forgetful(path, written, *rest):
         done = real(path, written, *rest)
-        if name == "create_log":
+        if harm == "a bit of the log":
             flip(path, 500)
+        elif harm == "the end of the log":
+            os.truncate(path, path.stat().st_size - 20)
         else:
             spoil(path / "checkpoints" / f"{written.number:08d}")
         return done
@@ -90,11 +95,8 @@ def test_what_was_written_is_read_back_before_it_counts(opened, monkeypatch, nam
 
 
 def test_what_cannot_be_removed_is_no_failure(opened, monkeypatch, caplog):
-    def stuck(*_):
-        raise OSError(errno.EIO, "the disk says no")
-
     with monkeypatch.context() as broken:
-        broken.setattr(scroll_tactile_store.store, "remove_unnamed", stuck)
+        broken.setattr(scroll_tactile_store.store, "remove_unnamed", fails())
         compact(opened, 5)
     assert "what was replaced could not be removed" in caplog.text
     assert holds(opened, compacted=5, latest=LAST)
@@ -103,35 +105,28 @@ def test_what_cannot_be_removed_is_no_failure(opened, monkeypatch, caplog):
     assert len(folders(opened.path)) == 2
 
 
-def test_a_reader_in_the_middle_gets_the_rest_or_is_told(opened):
-    with Store.open(opened.path, mode="read") as reader:
+def test_a_reader_goes_on_with_what_it_has_until_it_looks_over_any_number_of_compactions(opened):
+    with Store.open(opened.path, mode="read") as reader, Store.open(opened.path, mode="read") as lazy:
         early, late, heads = reader.records(), reader.records(), reader.heads()
         assert [next(early).sequence for _ in range(3)] == [1, 2, 3]
-        for expected in range(1, 8):
-            assert next(late).sequence == expected
+        assert [next(late).sequence for _ in range(7)] == [1, 2, 3, 4, 5, 6, 7]
         compact(opened, 5)
-        # What it has open it gives until it asks.
         assert next(early).sequence == 4
-        assert (reader.compacted, reader.state().compacted) == (0, 5)
+        assert (reader.compaction(), reader.compacted, reader.state().compacted) == (None, 0, 5)
         with pytest.raises(CompactedError, match="row 5"):
             next(early)
-        assert [row.sequence for row in late] == list(range(8, LAST + 1))
-        assert [head.sequence for head in heads] == list(range(1, LAST + 1))
+        assert sequences(late) == list(range(8, LAST + 1))
+        assert sequences(heads) == list(range(1, LAST + 1))
         assert holds(reader, compacted=5, latest=LAST)
-
-
-def test_a_reader_stays_open_over_compactions(opened):
-    with Store.open(opened.path, mode="read") as reader, Store.open(opened.path, mode="read") as lazy:
-        files = open_files()
-        last = LAST
-        for last_sequence in range(1, 5):
+        files, last = open_files(), LAST
+        for last_sequence in range(6, 10):
             assert add(opened, last := last + 1).sequence == last
             compact(opened, last_sequence)
-            reader.state()
+            with pytest.raises(CompactedError, match="read it anew"):
+                reader.compaction()
             assert holds(reader, kept=last, compacted=last_sequence, latest=last)
         lazy.state()
-        assert holds(lazy, kept=last, compacted=4, latest=last)
-        assert log_of(opened.path).name == "log-00000005"
+        assert holds(lazy, kept=last, compacted=9, latest=last)
         assert open_files() == files
     assert damage(opened.path) == []
 
@@ -139,36 +134,28 @@ def test_a_reader_stays_open_over_compactions(opened):
 # What the judges of tests/faults found.
 
 
-@pytest.mark.parametrize(
-    "module", [scroll_tactile_store.store, scroll_tactile_store.backup], ids=["a reader", "a backup"]
-)
-def test_whoever_comes_while_a_log_takes_the_place_of_another_takes_the_new_one(plain, monkeypatch, module):
-    path = plain
-    before = [read_current(path / "CURRENT")]
-    with Store.open(path) as writer:
-        commit(writer.compact, 16)
-    with Store.open(path, mode="read") as reader:
-        monkeypatch.setattr(module, "read_current", lambda *given: before.pop() if before else read_current(*given))
-        if module is scroll_tactile_store.backup:
-            reader.backup(path.parent / "copy")
-            path = path.parent / "copy"
-        with Store.open(path, mode="read") as again:
-            assert (again.last, again.compacted, before) == (LAST, 16, [])
+@pytest.mark.parametrize("failing", ["the log", "the folder"])
+def test_a_compaction_that_is_committed_stands_whatever_fails_behind_its_commit(opened, monkeypatch, caplog, failing):
+    """The new log cannot be opened at once; or the folder not synced, and the next append makes up for that."""
+    synced, calls = os.fsync, []
 
+    def fail_once(descriptor):
+        found = os.path.realpath(f"/proc/self/fd/{descriptor}")
+        if get_current(opened.path)["log"][0] == 2 and found == str(
+            log_of(opened.path) if failing == "the log" else opened.path
+        ):
+            calls.append(found)
+            if len(calls) == 1:
+                fails()()
+        synced(descriptor)
 
-def test_a_compaction_that_is_committed_stands_though_its_log_cannot_be_opened_at_once(plain, monkeypatch, caplog):
-    path = plain
-    synced = scroll_tactile_store.log.sync_open
-
-    def failing(descriptor, **how):
-        if read_current(path / "CURRENT").log == 2:
-            monkeypatch.setattr(scroll_tactile_store.log, "sync_open", synced)
-            raise OSError(errno.EIO, "the disk")
-        synced(descriptor, **how)
-
-    with Store.open(path) as writer:
-        monkeypatch.setattr(scroll_tactile_store.log, "sync_open", failing)
-        commit(writer.compact, 16)
-        assert "could not be removed" in caplog.text
-        assert (writer.compacted, add(writer, LAST + 1).sequence) == (16, LAST + 1)
-    assert (damage(path), log_of(path).name) == ([], "log-00000002")
+    monkeypatch.setattr(os, "fsync", fail_once)
+    if failing == "the log":
+        commit(opened.compact, 16)
+        assert [record.levelname for record in caplog.records][:1] == ["WARNING"]
+    else:
+        with pytest.raises(StoreError, match="Input/output error"):
+            commit(opened.compact, 16)
+    assert (opened.compacted, add(opened, LAST + 1).sequence) == (16, LAST + 1)
+    assert len(calls) > 1
+    assert (log_of(opened.path).name, damage(opened.path)) == ("log-00000002", [])

@@ -4,24 +4,10 @@ import json
 import shutil
 
 import pytest
-from forging import frames_of, get_current, log_of, set_current, write_log
+from forging import describe_again, get_current, log_of, set_current
 from scroll_tactile_store import DamageError, NotAStoreError, Store, VersionError, check_store, repair_store
-from scroll_tactile_store.layout import log_path
-from scroll_tactile_store.records import payload_digest
-from store_builds import (
-    IDENTITY,
-    LAST,
-    add,
-    agrees,
-    commit,
-    contents,
-    cut_rows,
-    damage,
-    flip,
-    folders,
-    in_turns,
-    newest,
-)
+from second_reader import digest
+from store_builds import IDENTITY, LAST, add, agrees, commit, contents, damage, flip, in_turns, is_refused, newest
 
 HARMS = {
     "gone": lambda file: file.unlink(),
@@ -37,10 +23,7 @@ HARMS = {
 def test_what_is_lost_with_it_is_nothing(either, which, harm):
     harm(either / "CURRENT")
     before = contents(either)
-    for mode in ("read", "write"):
-        with pytest.raises(DamageError, match="repair") as caught:
-            Store.open(either, mode=mode, identity={"for": "another"})
-        assert caught.value.path == either / "CURRENT"
+    assert is_refused(either, identity={"for": "another"}).path == either / "CURRENT"
     assert [problem.kind for problem in damage(either)] == ["spare"]
     after = contents(either)
     assert {name: after[name] for name in before} == before
@@ -52,69 +35,53 @@ def test_what_is_lost_with_it_is_nothing(either, which, harm):
         commit(opened.compact, LAST + 1)
 
 
-def newest_is(path, **changes):
-    """What `CURRENT` says of the newest checkpoint, with changes."""
-    return dict(get_current(path)["newest"]) | changes
-
-
-def placed(path, **changes):
+def placed(offset=None, number=None, previous=None):
     """The newest checkpoint at another place in the log."""
-    place = dict(zip(("offset", "number", "previous"), newest_is(path)["place"], strict=True)) | changes
-    return {"newest": newest_is(path, place=list(place.values()))}
+
+    def changes(known):
+        place = [new or old for new, old in zip((offset, number, previous), known["newest"]["place"], strict=True)]
+        return {"newest": known["newest"] | {"place": place}}
+
+    return changes
 
 
-CURRENTS = {
-    "no log": lambda path: {"log": None},
-    "a log in words": lambda path: {"log": ["../../log", get_current(path)["log"][1]]},
-    "a log that is not there": lambda path: {"log": [7, get_current(path)["log"][1]]},
-    "a log of the last number": lambda path: {"log": [2**63 - 1, get_current(path)["log"][1]]},
-    "a log of another identity": lambda path: {"log": [get_current(path)["log"][0], "00" * 8]},
-    "a text for a checkpoint": lambda path: {"newest": "x"},
-    "a checkpoint without a place": lambda path: {"newest": newest_is(path, place=None)},
-    "a last row in words": lambda path: {"newest": newest_is(path, last_sequence="15")},
-    "a number above any": lambda path: {"newest": newest_is(path, number=2**64)},
-    "a place in no frame": lambda path: placed(path, offset=newest_is(path)["place"][0] + 1),
-    "a place beyond the end": lambda path: placed(path, offset=2**40),
-    "a place of another number": lambda path: placed(path, number=3),
-    "a place of another checksum": lambda path: placed(path, previous="00" * 16),
+def named(**changes):
+    return lambda known: {"newest": known["newest"] | changes}
+
+
+def logged(number=1, identity=None):
+    return lambda known: {"log": [number, identity or known["log"][1]]}
+
+
+CURRENTS = {  # what it says in place of what it said; all but the last are about numbers and texts that nobody wrote
+    "no log": lambda known: {"log": None},
+    "a log in words": logged("../../log"),
+    "a text for a checkpoint": lambda known: {"newest": "x"},
+    "a checkpoint without a place": named(place=None),
+    "a last row in words": named(last_sequence="15"),
+    "a number above any": named(number=2**64),
+    "a log that is not there": logged(7),
+    "a log of the last number": logged(2**63 - 1),
+    "a log of another identity": logged(1, "00" * 8),
+    "a place in no frame": placed(offset=500),
+    "a place beyond the end": placed(offset=2**40),
+    "a place of another number": placed(number=3),
+    "a place of another checksum": placed(previous="00" * 16),
 }
 
 
 @pytest.mark.parametrize("changes", CURRENTS.values(), ids=CURRENTS)
 def test_what_it_never_said_is_named_and_repaired(plain, changes):
-    set_current(plain, **changes(plain))
-    with pytest.raises(DamageError, match=r"repair the store|another store"):
-        Store.open(plain)
+    log, before = log_of(plain), log_of(plain).read_bytes()
+    set_current(plain, **changes(get_current(plain)))
+    is_refused(plain, "repair the store|another store")
     assert damage(plain)
-    try:
-        with Store.open(plain, mode="read") as opened:  # which can begin at the beginning
-            assert [head.sequence for head in opened.heads()] == list(range(1, LAST + 1))
-    except DamageError:
-        pass
-    before = log_path(plain, 1).read_bytes()
-    repair_store(plain)
+    assert repair_store(plain).kept == LAST or get_current(plain)["compaction"] is not None
     assert damage(plain) == []
-    assert before in contents(plain).values()  # kept aside, if anything of it was not believed
+    assert before in (log.read_bytes() if log.exists() else None, *contents(plain).values())  # kept aside
     with Store.open(plain) as opened:
         assert add(opened, opened.last + 1).sequence == opened.last
     assert damage(plain) == []
-
-
-@pytest.mark.parametrize("current", ["of now", "gone"])
-def test_of_several_logs_the_one_with_the_last_row_is_gone_on_from(plain, current):
-    """Compaction failed just before `CURRENT`, the store went on, and then the disk lost some of it."""
-    other = log_path(plain, 3)
-    shutil.copy(log_of(plain), other)
-    with Store.open(plain, mode="read"):
-        cut_rows(plain, 19)
-    if current == "of now":
-        log_of(plain).rename(log_path(plain, 2))
-        set_current(plain, log=[7, get_current(plain)["log"][1]])
-    else:
-        (plain / "CURRENT").unlink()
-    assert damage(plain)
-    assert repair_store(plain).kept == LAST
-    assert agrees(plain, latest=15)
 
 
 def test_a_log_and_a_checkpoint_of_another_store_are_not_believed(plain, tmp_path):
@@ -124,16 +91,13 @@ def test_a_log_and_a_checkpoint_of_another_store_are_not_believed(plain, tmp_pat
         commit(other.commit, 3)
     mixed = shutil.copytree(plain, tmp_path / "mixed")
     shutil.copy(log_of(tmp_path / "other"), log_of(mixed))
-    for mode in ("read", "write"):
-        with pytest.raises(DamageError, match=r"another store|holds no batch"):
-            Store.open(mixed, mode=mode)
-    assert "another store" in damage(mixed)[0].what
+    is_refused(mixed, r"another store|holds no batch")
+    assert "another store" in " ".join(problem.what for problem in damage(mixed))
     # A checkpoint of the other, named by a forged CURRENT.
     shutil.rmtree(newest(plain))
     shutil.copytree(newest(tmp_path / "other"), newest(plain))
-    set_current(
-        plain, newest=newest_is(plain, last_sequence=3, sha256=get_current(tmp_path / "other")["newest"]["sha256"])
-    )
+    known = get_current(tmp_path / "other")["newest"]
+    set_current(plain, **named(last_sequence=3, sha256=known["sha256"])(get_current(plain)))
     assert "another store" in " ".join(problem.what for problem in damage(plain))
     repair_store(plain)
     assert damage(plain) == []
@@ -141,38 +105,46 @@ def test_a_log_and_a_checkpoint_of_another_store_are_not_believed(plain, tmp_pat
         assert (opened.last, opened.latest()) == (LAST, None)
 
 
-def refuses_the_format(path):
-    before = contents(path)
-    for call in (Store.open, lambda path: Store.open(path, mode="read"), check_store, repair_store):
-        with pytest.raises(VersionError, match=r"format \d; this release reads format \d: upgrade"):
-            call(path)
-    assert contents(path) == before
+# Other formats.
 
 
-@pytest.mark.parametrize("more", [{}, {"log": None, "more": [1]}])
-def test_a_newer_format_is_refused_and_not_touched(either, more):
-    set_current(either, format=4, **more)
-    refuses_the_format(either)
-    flip(either / "CURRENT", -20)  # and where that is not what was written, nothing is said of a format
-    with pytest.raises(DamageError):
-        Store.open(either)
-
-
-def test_a_newer_log_is_refused_and_not_touched(plain):
-    data = bytearray(log_of(plain).read_bytes())
+def raise_the_logs_version(path):
+    data = bytearray(log_of(path).read_bytes())
     data[6] = 2
-    data[72:88] = payload_digest(bytes(data[:72]))
-    log_of(plain).write_bytes(data)
-    refuses_the_format(plain)
+    data[72:88] = digest(bytes(data[:72]))
+    log_of(path).write_bytes(data)
 
 
-def test_an_older_format_is_refused_by_name_and_not_touched(plain):
-    set_current(plain, format=1)
-    before = contents(plain)
-    for attempt in (Store.open, repair_store):
-        with pytest.raises(VersionError, match=r"format 1, by scroll-tactile 0\.15 .*learn it again"):
-            attempt(plain)
-    assert contents(plain) == before
+def latest(path):
+    with Store.open(path, mode="read") as opened:
+        return opened.latest()
+
+
+UPGRADE, USES = r"format \d; this release reads format \d: upgrade", (latest, Store.open, check_store, repair_store)
+FORMATS = {
+    # what is done; what is said; to whom
+    "a newer CURRENT": (lambda path: set_current(path, format=4), UPGRADE, USES),
+    "a newer one of another kind": (lambda path: set_current(path, format=4, log=None, more=[1]), UPGRADE, USES),
+    "a newer log": (raise_the_logs_version, UPGRADE, USES),
+    "format 1": (lambda path: set_current(path, format=1), r"format 1, by .* 0\.15 .*learn it again", USES),
+    "format 2": (lambda path: set_current(path, format=2), r"format 2, by .* 0\.16 to 0\.18; .*learn it again", USES),
+    "a checkpoint of format 1": (lambda path: describe_again(path, format=1), "format 1, ", USES[:1]),
+    "a checkpoint of format 4": (lambda path: describe_again(path, format=4), "format 4; ", USES[:1]),
+}
+
+
+@pytest.mark.parametrize(("which", "make", "said", "uses"), in_turns(FORMATS), ids=FORMATS, indirect=["which"])
+def test_another_format_is_refused_by_name_and_not_touched(either, make, said, uses):
+    make(either)
+    before = contents(either)
+    for use in uses:
+        with pytest.raises(VersionError, match=said):
+            use(either)
+    assert contents(either) == before
+    if get_current(either)["format"] == 4:
+        flip(either / "CURRENT", -20)  # where that is not what was written, nothing is said of a format
+        with pytest.raises(DamageError):
+            Store.open(either)
 
 
 def test_of_an_empty_store_nothing_is_lost_with_it(tmp_path):
@@ -182,20 +154,3 @@ def test_of_an_empty_store_nothing_is_lost_with_it(tmp_path):
         Store.open(tmp_path, mode="read")
     with Store.open(tmp_path, identity={"a": 2}) as opened:
         assert opened.identity == {"a": 2}
-
-
-@pytest.mark.parametrize("harm", ["an older frame at the end", "a frame that is no row"])
-def test_what_was_never_appended_keeps_all_out(plain, harm):
-    if harm == "a frame that is no row":
-        write_log(plain, [b"no row"])
-    else:
-        frame, data = frames_of(plain)[18], log_of(plain).read_bytes()
-        log_of(plain).write_bytes(data + data[frame.offset : frame.end])
-    for mode in ("read", "write"):
-        with pytest.raises(DamageError, match="repair the store"):
-            Store.open(plain, mode=mode)
-    assert damage(plain)
-    kept = repair_store(plain).kept
-    assert kept == (15 if harm == "a frame that is no row" else LAST)
-    assert folders(plain) == ["00000001"]
-    assert agrees(plain, kept=kept, latest=15, **({} if kept == LAST else {"compacted": 15, "lost": range(1, 16)}))

@@ -1,15 +1,75 @@
-"""What other threads, a fork or ctrl-C do beside a call, at its worst moment."""
+"""What a writer, other threads, a fork or ctrl-C do beside a call, at its worst moment."""
 
+import gc
+import multiprocessing
 import os
 import threading
+from functools import partial
 
 import numpy as np
 import pytest
-from scroll_tactile_store import RecordError, Store, StoreClosedError, check_store
+from scroll_tactile_store import LockedError, RecordError, Store, StoreClosedError, check_store
 from scroll_tactile_store import log as store_log
 from scroll_tactile_store.archive import write_archive
 from scroll_tactile_store.files import tree_size
 from scroll_tactile_store.rows import Rows
+from store_builds import add, commit, damage, same_arrays, sequences, state, values
+
+
+def look(path, copy):
+    with Store.open(path, mode="read") as reader:
+        last, after = reader.last, max(reader.compacted, reader.last - 3)
+        assert sequences(reader.heads(last - 3)) == [last - 2, last - 1, last]
+        found = [(row.sequence, row.arrays["x"].tobytes()) for row in reader.records(after)]
+        assert found == [(n, values(n).tobytes()) for n in range(after + 1, last + 1)]
+        newest = reader.latest()
+        assert same_arrays(newest.arrays, state(newest.last_sequence))
+    return last
+
+
+def check(path, copy):
+    assert damage(path) == []
+
+
+def back_up(path, copy):
+    with Store.open(path, mode="read") as reader:
+        reader.backup(copy)
+    return look(copy, None)
+
+
+DOES = {
+    "appends": lambda writer: [add(writer, writer.last + 1) for _ in range(2)],
+    "commits": lambda writer: [commit(writer.commit, writer.last) for _ in range(2)],
+    "compacts": lambda writer: [add(writer, writer.last + 1), commit(writer.compact, writer.last)],
+}
+
+
+@pytest.mark.parametrize("does", DOES)
+@pytest.mark.parametrize(("use", "places"), [(look, range(24)), (check, range(0, 48, 5)), (back_up, range(0, 60, 5))])
+def test_whoever_reads_finds_all_that_was_there_whatever_a_writer_does_meanwhile(
+    tmp_path, monkeypatch, caplog, use, places, does
+):
+    """A writer does it once, before the first, second, third … file that is opened and part of one that is read."""
+    with Store.open(tmp_path / "s", identity={}) as writer:
+        [add(writer, number) for number in range(1, 4)]
+        commit(writer.commit, 2)
+        for place in places:
+            calls, before = [], writer.last
+
+            def call(*given, real, calls=calls, place=place, **named):
+                calls.append(real)
+                if len(calls) == place + 1:
+                    DOES[does](writer)
+                return real(*given, **named)
+
+            with monkeypatch.context() as watched:
+                for name in ("open", "read"):
+                    watched.setattr(os, name, partial(call, real=getattr(os, name)))
+                found = use(tmp_path / "s", tmp_path / f"copy {place}")
+            assert found in (None, before, writer.last)
+            commit(writer.commit, writer.last)  # or what is read grows faster than `place`
+            assert place > 15 or place < len(calls)
+    assert caplog.records == []
 
 
 @pytest.fixture
@@ -18,19 +78,6 @@ def opened(tmp_path):
         for i in range(10):
             made.append("add", "label", b"%d" % i, arrays={"x": np.arange(3.0)})
         yield made
-
-
-def in_a_fork(do):
-    """Whether it raises StoreClosedError in a forked child, which then ends as a script does."""
-    if (pid := os.fork()) == 0:
-        try:
-            do()
-            os._exit(0)
-        except StoreClosedError:
-            os._exit(7)
-        finally:
-            os._exit(1)
-    return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 7
 
 
 def test_a_compaction_that_waited_for_a_later_one_is_refused(opened, monkeypatch):
@@ -81,31 +128,35 @@ def test_closing_waits_for_what_another_thread_commits(opened, monkeypatch):
         assert [head.sequence for head in again.heads()] == [*range(1, 11)]
 
 
-def test_what_was_opened_is_not_read_on_in_a_fork(opened):
-    heads = opened.heads()
-    next(heads)
-    assert in_a_fork(lambda: next(heads))
-    opened.append("add", "label", b"x")
-    assert check_store(opened.path) == []
-
-
-def test_a_fork_that_ends_leaves_its_parents_unpacked_store(opened, tmp_path):
+def test_a_fork_may_not_use_its_parents_store_and_takes_neither_its_lock_nor_what_was_unpacked(opened, tmp_path):
     write_archive(opened.path, tmp_path / "packed")
     assert tree_size(tmp_path / "packed") > 1000
+    heads = opened.heads()
+    next(heads)
     with Store.open(tmp_path / "packed", mode="read") as packed:
         folder = packed._folder
-        if (pid := os.fork()) == 0:
-            try:
-                packed.__dict__.clear()
-                import gc
 
-                gc.collect()
-            finally:
-                os._exit(0)
-        os.waitpid(pid, 0)
-        assert folder.exists()
-        assert packed.state().last == 10
+        def child(said):
+            for use in (lambda: next(heads), lambda: opened.append("add", "label", b"x"), lambda: packed.last):
+                with pytest.raises(StoreClosedError) as caught:
+                    use()
+                said.put(str(caught.value))
+            opened.close()
+            packed.__dict__.clear()
+            gc.collect()
+
+        said = multiprocessing.get_context("fork").SimpleQueue()
+        process = multiprocessing.get_context("fork").Process(target=child, args=(said,))
+        process.start()
+        process.join(60)
+        assert process.exitcode == 0 and all("fork" in said.get() for _ in range(3))
+        said.close()
+        with pytest.raises(LockedError):
+            Store.open(opened.path)
+        assert folder.exists() and packed.state().last == 10
     assert not folder.exists()
+    assert opened.append("add", "label", b"x").sequence == 11
+    assert check_store(opened.path) == []
 
 
 def test_a_reader_that_is_interrupted_keeps_no_half_of_a_batch(opened, monkeypatch):

@@ -108,15 +108,12 @@ def _learn(
 ) -> None:
     """Learn, and say what became of it. workers: who learns, as of `learn` in Python."""
     from scroll_tactile.clients.learning.fleet import learn
-    from scroll_tactile.clients.learning.sources import find_sources
 
-    found, missing = find_sources(sources)
-    options, chosen = how.of(found), sensor_for(memory, sensor, how.preset)
+    options, chosen = how.options(), sensor_for(memory, sensor, how.preset)
     if chosen is None and not memory.exists():
         raise no_memory(memory, new=True)
     with progress_bar() as progress:
-        done = learn(found, memory, options, sensor=chosen, progress=progress, **workers)
-    done.refused[:0] = missing
+        done = learn(sources, memory, options, sensor=chosen, progress=progress, **workers)
     if as_json:
         learned = {"files": done.sources, "touches": done.observations, "learned": dict(sorted(done.learned.items()))}
         left = {"skipped": done.repeated, "refused": _refusals(done.refused), "deaths": done.deaths}
@@ -161,7 +158,7 @@ def evaluate(
     from scroll_tactile.clients.learning.sources import find_sources
 
     found, missing = find_sources(sources)
-    options = how.of(found)
+    options = how.options().among(found, sources)
     with opened(memory, mode="read") as learner, progress_bar() as progress:
         done = evaluate_sources(learner, found, options, progress, of=of, with_learned=with_learned)
     refused = [*missing, *done.refused]

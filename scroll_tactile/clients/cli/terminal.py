@@ -43,7 +43,6 @@ Mode = Literal["write", "read"]
 _options: ContextVar[dict[str, str]] = ContextVar("_options")  # of the command that was typed, by their names in Python
 
 
-LabelSource = StrEnum("LabelSource", ["file", "folder", "topic", "task"])
 Cut = StrEnum("Cut", ["episodes", "intervals", "none", "contact"])
 
 MemoryFolder = Annotated[Path, Argument(help="The folder of the memory.", show_default=False)]
@@ -93,7 +92,13 @@ class Named(Reading):
     """How recordings are read, cut into touches and named: the fields of `SourceOptions`, as they are typed."""
 
     material: Annotated[str | None, Option("--label", help="What all of them are touches of.")] = None
-    by: Annotated[LabelSource | None, Option("--label-by", help="What names each touch.")] = None
+    by: Annotated[
+        str | None,
+        Option(
+            "--label-by",
+            help="What names each touch: file, folder, topic or task; or folder:2, the second below the one typed.",
+        ),
+    ] = None
     intervals: Annotated[
         Path | None,
         Option(
@@ -110,8 +115,8 @@ class Named(Reading):
         Cut | None, Option(help="Where touches begin and end; without it by intervals or episodes if there are any.")
     ] = None
 
-    def of(self, found: Sequence[str]) -> SourceOptions:
-        """How these recordings are read, cut and named. Raises InputError for options that do not fit together."""
+    def options(self) -> SourceOptions:
+        """How recordings are read, cut and named. Raises InputError for options that do not fit together."""
         from scroll_tactile.clients.learning.sources import SourceOptions
         from scroll_tactile.recordings import declared_quantities, read_intervals
 
@@ -120,7 +125,7 @@ class Named(Reading):
         if self.intervals is not None:
             if self.labels is not None:
                 raise InputError("give --labels or --label-topic: both say where touches begin")
-            given["intervals"] = tuple(read_intervals(self.intervals, found))
+            given["intervals"] = tuple(read_intervals(self.intervals))
             given["quantities"] = tuple(declared_quantities(self.intervals))
             if not given["intervals"]:
                 raise InputError(f"expected touches in {self.intervals}, one row each; there are none")

@@ -347,7 +347,7 @@ def adapt(
     from scroll_tactile.clients.learning.sources import Refused, find_sources, source_touches
 
     found, missing = find_sources(sources)
-    options = how.of(found)
+    options = how.options().among(found, sources)
     with opened_for_upkeep(folder) as learner, progress_bar() as progress:
         touches = [touch for address in found for touch in source_touches(learner, address, options)]
         refused = missing + [touch for touch in touches if isinstance(touch, Refused)]

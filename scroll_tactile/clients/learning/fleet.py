@@ -41,8 +41,7 @@ from scroll_tactile.embeddings.protocol import Embedding
 from scroll_tactile.errors import CapacityError, InputError, MismatchError, RangeWarning, ScrollTactileError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.memory.identity import Identity
-from scroll_tactile.memory.touch_rows import SOURCE
-from scroll_tactile.persistence.merge import Choice, MergeRules
+from scroll_tactile.persistence.merge import Choice
 from scroll_tactile.quantities import Quantity, require_declarable
 from scroll_tactile.recipe import Recipe, RecipeRequest
 from scroll_tactile.recordings.locations import local
@@ -126,11 +125,13 @@ def learn(
     if executor is not None and not isinstance(executor, Executor):
         raise InputError(f"expected an Executor, such as client.get_executor() of Dask; came {type(executor).__name__}")
     begun, place = time.perf_counter(), Path(memory).absolute()
-    found, missing = find_sources([os.fspath(source) for source in sources])
+    paths = [os.fspath(source) for source in sources]
+    found, missing = find_sources(paths)
+    options = (options or SourceOptions()).among(found, paths)
     report = FleetReport(sources=len(found), refused=missing)
     asked = RecipeRequest.of(sensor, embedding, {"exemplars": exemplars, "kept_touches": kept_touches})
     with _opened(place, asked) as learner:
-        run = _Run(learner, options or SourceOptions(), descriptions, report, progress)
+        run = _Run(learner, options, descriptions, report, progress)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RangeWarning)  # it is said at the end
             if executor is None and workers == 1:
@@ -354,12 +355,12 @@ class _Run:
 
     def _merge(self, path: Path, clipped: Collection[bytes] = (), source: str = "") -> None:
         """Merge a memory, each touch once. clipped: as of `Learned`. source: of touches that have none."""
-        rules = MergeRules(True, self._descriptions, clipped, source or None)
+        how: Any = {"choice": self._descriptions, "one_name": True, "clipped": clipped, "source": source or None}
         merged, refused = self._learner._ledger.merge(
-            path, rules, lambda what, done, of: self._show(f"{what} {done} of {of} touches")
+            path, lambda what, done, of: self._show(f"{what} {done} of {of} touches"), **how
         )
         self._report.repeated += merged.shared
-        self._report.refused += [Refused(str(head.attributes.get(SOURCE, source)), why) for head, why in refused]
+        self._report.refused += [Refused(str(head.attributes.get("source", source)), why) for head, why in refused]
 
     def _note(self, done: Learned) -> None:
         self._report.refused += done.refused

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from pathlib import Path
-from typing import Literal
+from pathlib import Path, PurePosixPath
+from typing import Any, Literal, Self
 
 import numpy as np
 from scroll_tactile_store.archive import ARCHIVE_BYTES, is_archive
@@ -21,6 +22,7 @@ from scroll_tactile.recordings import Interval, Recording, Touch, find, presets,
 from scroll_tactile.recordings.headings import Heading, Noted, noted_in
 from scroll_tactile.recordings.locations import file_system, is_remote
 from scroll_tactile.recordings.recording import require_columns
+from scroll_tactile.recordings.touches import require_found
 from scroll_tactile.settings import LONGEST_SOURCE, require_name
 from scroll_tactile.signals.stream import Stream
 
@@ -41,6 +43,9 @@ WHOLE = ("metadata.yaml", "meta/info.json", ".zgroup", "zarr.json")  # in a fold
 
 Cut = Literal["episodes", "intervals", "none", "contact"]
 
+_FOLDER = re.compile(r"folder:(\d{1,4})", re.ASCII)
+_BY = ("topic", "file", "folder", "task")
+
 
 @dataclass(frozen=True)
 class SourceOptions:
@@ -48,9 +53,10 @@ class SourceOptions:
 
     topic, field, clock, columns, preset, labels, annotate: as of `recordings.read`. cut: None cuts by the intervals
     where there are some, by episodes where a recording has some, and not otherwise.
-    material: the name of all touches. by: what names each touch, as of `recordings.touches`. intervals: the table's.
-    At most one of the three names them; without any, episodes name themselves. quantities: that are declared before
-    anything is learned, as the table's headings do (`recordings.declared_quantities`), beside those of `annotate`.
+    material: the name of all touches. by: what names each touch, as of `recordings.touches`, or "folder:2", the second
+    folder below one of `tops`, see `among`. intervals: the table's. At most one of the three names them; without any,
+    episodes name themselves. quantities: that are declared before anything is learned, as the table's headings do
+    (`recordings.declared_quantities`), beside those of `annotate`.
 
     The value of a touch in a column that annotates it is the mean of the touch's readings that have a number there, its
     label the one text that they have: a touch with two is refused.
@@ -67,15 +73,20 @@ class SourceOptions:
     annotate: Sequence[str] = ()
     cut: Cut | None = None
     material: str | None = None
-    by: Literal["topic", "file", "folder", "task"] | None = None
+    by: str | None = None
     intervals: Sequence[Interval] | None = None
     quantities: Sequence[Quantity] = ()
+    tops: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if sum(given is not None for given in (self.material, self.by, self.intervals)) > 1:
             raise InputError(
                 "touches can be named in one way: by one of material=, by= and intervals=",
                 argument="material by intervals",
+            )
+        if self.by is not None and self.by not in _BY and _FOLDER.fullmatch(self.by) is None:
+            raise InputError(
+                f"expected by={', '.join(map(repr, _BY))} or 'folder:2'; came {self.by!r:.60}", argument="by"
             )
         if self.material is not None:
             require_name(self.material)
@@ -96,6 +107,45 @@ class SourceOptions:
                 f"expected each quantity and axis once in annotate=; came {twice[0]!r} several times",
                 argument="annotate",
             )
+
+    def among(self, sources: Sequence[str], paths: Sequence[str]) -> Self:
+        """These options for the sources that were found in some paths, below which "folder:2" counts.
+
+        Raises InputError for an interval whose file is none of the sources, or several, and for by="folder" where
+        folders name no materials: they are numbers alone, or one name lies in several folders.
+        """
+        files = [source for source in sources if not is_memory(source)]
+        require_found(self.intervals or (), files)
+        placed = replace(self, tops=tuple(paths))
+        if self.by == "folder":
+            placed._require_folders([placed.folders(source) for source in files])
+        return placed
+
+    def folders(self, source: str) -> list[str]:
+        """The folders from the path that was typed down to a source; those in its path where it was typed itself."""
+        own = _parts(source)[:-1]
+        tops = (_parts(top) for top in self.tops)
+        below = own[max((len(top) for top in tops if own[: len(top)] == top), default=0) :]
+        return below or own[-1:]
+
+    def _require_folders(self, found: Sequence[list[str]]) -> None:
+        above: dict[str, set[tuple[str, ...]]] = {}
+        for folders in filter(None, found):
+            above.setdefault(folders[-1], set()).add(tuple(folders[:-1]))
+        numbers = [name for name in above if not any(map(str.isalpha, name))]
+        several = [name for name, places in above.items() if len(places) > 1]
+        if not numbers and not several:
+            return
+        why = f"{numbers[0]!r} is a number" if numbers else f"{several[0]!r} lies in several folders"
+        levels = []
+        for level in range(1, max(map(len, found)) + 1):
+            names = list(dict.fromkeys(folders[level - 1] for folders in found if len(folders) >= level))
+            levels.append(f"by='folder:{level}' for {', '.join(names[:3])}{' …' if len(names) > 3 else ''}")
+        raise InputError(
+            f"by='folder' would take a folder for a material that is none: {why}. Say which folder names the material: "
+            f"{'; '.join(levels)}",
+            argument="by",
+        )
 
     @property
     def declared(self) -> list[Quantity]:
@@ -118,10 +168,16 @@ class SourceOptions:
         )
         if self.intervals is not None:
             return recording, touches(recording, self.intervals)
-        if self.cut == "contact":
-            return recording, touches(recording, partial(_contacts, learner), self.by)
         whole = self.cut == "none" or (self.cut is None and not recording.episodes)
-        return recording, touches(recording, "whole" if whole else "episodes", self.by)
+        cut: Any = partial(_contacts, learner) if self.cut == "contact" else "whole" if whole else "episodes"
+        if (level := _FOLDER.fullmatch(self.by or "")) is None:
+            return recording, touches(recording, cut, self.by)
+        folders = self.folders(address)
+        if not 0 < int(level[1]) <= len(folders):
+            there = ", ".join(f"by='folder:{i + 1}', {name}" for i, name in enumerate(folders))
+            raise InputError(f"it has no folder {level[1]}; expected {there or 'by=file'}", argument="by")
+        name = folders[int(level[1]) - 1]
+        return recording, tuple(replace(touch, material=name) for touch in touches(recording, cut))
 
 
 def _contacts(learner: TactileLearner, recording: Recording) -> list[tuple[int, int]]:
@@ -140,6 +196,12 @@ def _contacts(learner: TactileLearner, recording: Recording) -> list[tuple[int, 
             argument="cut",
         )
     return spans
+
+
+def _parts(address: str) -> list[str]:
+    """The parts of a path or an address, without what stands for this folder or the root."""
+    path = PurePosixPath(address.partition("://")[2] if is_remote(address) else Path(address).as_posix())
+    return [part for part in path.parts if part not in ("/", "..", ".")]
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,6 @@ from scroll_tactile.errors import (
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.live.decision import DecisionRule, decision_rule
 from scroll_tactile.matching.kept_arrays import KeptTouch
-from scroll_tactile.memory.axes import axis_memory
 from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.prediction.features import FeatureExtractor
@@ -335,7 +334,7 @@ class MemoryFacts:
     @cached_property
     def memory(self) -> Memory:
         """What was learned, by materials or by labels."""
-        return self.learner.memory if self.of is None else axis_memory(self.learner.memory, self.of)
+        return self.learner.memory if self.of is None else self.learner.memory.of_axis(self.of)
 
     def __post_init__(self) -> None:
         self.names = "materials" if self.of is None else f"labels on {self.of}"

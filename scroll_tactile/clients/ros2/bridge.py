@@ -229,7 +229,7 @@ class Bridge:
     @property
     def learned(self) -> Receipt | None:
         """What this bridge learned last, and nobody took back."""
-        left = [receipt for receipt in self._learned if not self.learner.memory.is_gone(receipt.sequence)]
+        left = [receipt for receipt in self._learned if receipt.sequence not in self.learner.memory.retracted]
         return left[-1] if left else None
 
     # What services ask for. Each says what was done, is durable when it returns, and raises what the learner raises.

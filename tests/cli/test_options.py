@@ -4,11 +4,14 @@ import contextvars
 import json
 import pickle
 import re
+import sqlite3
 
+import bags
 import h5py
 import numpy as np
 import pytest
 from commands import refused, run
+from rosbags.typesys import get_types_from_msg
 
 from scroll_tactile import TactileLearner, recordings, sensors
 from scroll_tactile.clients.cli import terminal
@@ -30,7 +33,7 @@ def folder(tmp_path_factory):
         readings = SCENE.touch(name, 0).readings
         np.save(folder / "rec" / name / "0.npy", np.column_stack([np.zeros((len(readings), 25)), readings]))
     np.save(folder / "touch.npy", readings)
-    np.savetxt(folder / "comma.csv", readings[:3], delimiter=";", fmt="%.1f")
+    np.savetxt(folder / "comma.csv", 1 + readings[:3] % 9, delimiter=";", fmt="%.3f")
     text = (folder / "comma.csv").read_text().replace(".", ",")
     (folder / "comma.csv").write_text(text)
     (folder / "table.csv").write_text("file,begin,end,material\noak/0,0,2,oak\nfelt/0,1,3,felt\n")
@@ -189,10 +192,11 @@ def test_a_table_cuts_what_has_no_clock_at_the_sensors_rate(folder, tmp_path, mo
     assert [each["source"] for each in listed] == ["rec/felt/0.npy[100:300] 25:44", "rec/oak/0.npy[0:200] 25:44"]
 
 
-def test_what_no_option_can_do_is_said_to_be_pythons(folder, monkeypatch):
+def test_a_decimal_comma_is_said_by_the_option_that_is_proposed(folder, monkeypatch):
     monkeypatch.chdir(folder)
-    result = run("learn", "new", "comma.csv", "--sensor", "biotac", "--label", "oak")
-    assert "pass decimal=',' (decimal=: from Python alone)" in result.stderr
+    words = ("learn", "new", "comma.csv", "--sensor", "biotac", "--label", "oak")
+    assert "if it is before decimals, pass --decimal ','" in run(*words).stderr
+    assert "before decimals" not in run(*words, "--decimal", ",").stderr
 
 
 def test_probabilities_are_written_with_six_digits():
@@ -202,3 +206,23 @@ def test_probabilities_are_written_with_six_digits():
     assert prediction.ranking_as_json() == [["felt", 0.123457], ["oak", 0.0], ["silk", 3e-9]]
     assert prediction.ranking_as_json(1) == [["felt", 0.123457]]
     assert Prediction(None, 0.0, (), float("inf"), False, 0.0).as_json()["novelty"] is None
+
+
+def test_the_definitions_that_an_error_asks_for_are_taken(tmp_path, monkeypatch):
+    """A bag of ROS 2 Humble, of a driver that no preset knows."""
+    store, kind = bags.typestore(2), "my/msg/Pad"
+    store.register(get_types_from_msg("float32[] values", kind))
+    values = np.random.default_rng(0).uniform(0, 4095, (200, 19)).astype(np.float32)
+    messages = [(bags.START + i / 100, store.types[kind](row)) for i, row in enumerate(values)]
+    path = bags.write(tmp_path / "b", store, {"/pad": messages}, form="db3")
+    with sqlite3.connect(path / "b.db3") as base:
+        base.execute("DROP TABLE message_definitions")
+    words = ("b", "--sensor", "biotac", "--topic", "/pad", "--field", "values")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "FOLDER").mkdir()
+    (tmp_path / "FOLDER" / "Pad.msg").write_text("float32[] values")
+    for line in (("learn", "m", *words, "--label", "felt"), ("report", words[0], "page.html", *words[1:])):
+        result = run(*line)
+        assert result.exit_code == 1 and "Give --definitions 'FOLDER', a folder with Pad.msg" in result.stderr
+        assert run(*line, "--definitions", "FOLDER").exit_code == 0
+    assert "--definitions FOLDER" in (tmp_path / "page.html").read_text()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,6 +21,7 @@ from scroll_tactile.clients.cli.terminal import (
     AsCsv,
     AsJson,
     Axis,
+    ByTimes,
     Columns,
     MemoryFolder,
     Reading,
@@ -27,15 +29,18 @@ from scroll_tactile.clients.cli.terminal import (
     Scene,
     Sources,
     StreamFile,
+    Timed,
     console,
     counted,
     estimate_text,
+    facts_as_json,
     materials_of,
     opened,
     opened_for_upkeep,
     percent,
     say,
     say_csv,
+    say_facts,
     say_json,
     say_refused,
     sensor_for,
@@ -43,15 +48,16 @@ from scroll_tactile.clients.cli.terminal import (
     verdict,
     with_options,
 )
-from scroll_tactile.errors import DescriptionError, InputError, printable
-from scroll_tactile.settings import LONGEST_SOURCE, require_name
+from scroll_tactile.errors import DescriptionError, InputError
+from scroll_tactile.settings import require_name
 
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
     from scroll_tactile.clients.learning.learning import Answered
-    from scroll_tactile.clients.learning.sources import Refused
+    from scroll_tactile.clients.learning.sources import Refused, SourceOptions, SourceTouch
+    from scroll_tactile.learner import TactileLearner
     from scroll_tactile.live.answers import LiveReport, LiveState, LiveTouch
     from scroll_tactile.live.session import LiveSession
     from scroll_tactile.results import Estimate
@@ -64,7 +70,19 @@ WORDS = {"yes": True, "no": False, "unknown": None}
 SHOWN = 5  # likeliest materials of a touch
 BAR = 30  # characters of a probability of one
 LONGEST_LINE = 2**24  # characters of a reading, of a camera, too
-IRREGULAR = ("lost", "repeated", "late", "surplus", "untimed", "gaps", "steps_back", "relearned", "truncated")
+GIVEN_UP = 100  # lines without a reading, before the first that has one
+IRREGULAR = (
+    "left_out",
+    "lost",
+    "repeated",
+    "late",
+    "surplus",
+    "untimed",
+    "gaps",
+    "steps_back",
+    "relearned",
+    "truncated",
+)
 
 ANSWER = ("source", "answer", "probability", "known", "novelty", "seconds")
 
@@ -82,7 +100,7 @@ def observe(
             "name, channels, rate, low, high, unit and duration; or give --preset. Needed only to make a new memory."
         ),
     ] = None,
-    how: Reading,
+    how: Timed,
     value: Annotated[
         list[str] | None,
         Option(help="What was measured of it, such as force=1.4, of a declared quantity; several times."),
@@ -92,8 +110,9 @@ def observe(
     ] = None,
 ) -> None:
     """Learn how a material feels, from one touch in a file; it is on disk when this returns."""
+    from scroll_tactile.clients.learning.sources import stored_source
     from scroll_tactile.learner import TactileLearner
-    from scroll_tactile.recordings import read
+    from scroll_tactile.signals.facts import OF_TOUCHES
 
     require_name(material)
     labels = _noted("axis", axis)
@@ -101,24 +120,37 @@ def observe(
         values = {name: float(number) for name, number in _noted("value", value).items()}
     except ValueError as error:
         raise InputError(f"expected --value as a name and a number, such as force=1.4: {error}") from None
-    recording = read(file, **vars(how))
-    chosen = sensor_for(memory, sensor, how.preset)
+    options, chosen = how.taken(cut="none", material=material), sensor_for(memory, sensor, how.preset)
     if chosen is not None and not memory.exists():
-        TactileLearner(sensor=chosen).stream(recording.stream(chosen))  # what is refused makes no memory
+        options = options.by_names([str(file)], chosen)
+        chosen = chosen.model_copy(update={"columns": tuple(options.names) or None})
+        _one_touch(TactileLearner(sensor=chosen), str(file), options)  # what is refused makes no memory
     with opened(memory, sensor=chosen, new=True) as learner:
-        source = printable(str(file))[-LONGEST_SOURCE:]
-        stream = learner.stream(recording.stream(learner.sensor))
-        others = [name for name in learner.names_of(stream) if name != material]
-        receipt = learner.observe(material, stream, values=values, labels=labels, source=source)
+        touch = _one_touch(learner, str(file), options.by_names([], learner.sensor))
+        say_facts([fact for fact in touch.facts if fact.kind not in OF_TOUCHES])  # of the others observe warns
+        source = stored_source(str(file))
+        receipt = learner.observe(material, touch.stream, values=values, labels=labels, source=source)
         count = learner.materials[material]
     clipped = f", {receipt.clipped} values outside the sensor's range clipped" if receipt.clipped else ""
     done = f"{receipt.seconds:g} s kept as observation {receipt.sequence}{clipped}"
     if receipt.repeated:
         done = f"this touch was learned already, as observation {receipt.sequence}"
     say(f"{shown(material)}: {done}")
-    if others:
-        say(f"this very touch is there as {', '.join(map(shown, others))}, too: relabel or retract one of them")
     say(f"it has now been observed {counted(count, 'time')}")
+
+
+def _one_touch(learner: TactileLearner, file: str, options: SourceOptions) -> SourceTouch:
+    """The one touch in a file. Raises InputError where it is refused, or is several."""
+    from scroll_tactile.clients.learning.sources import Refused, source_touches
+
+    found = list(source_touches(learner, file, options, named=False))
+    if isinstance(found[0], Refused):
+        raise found[0].error()
+    if len(found) > 1:
+        why = next(str(fact) for fact in found[0].facts if fact.then == "cut")
+        text = f"expected one touch; these are {len(found)}, for `scroll-tactile learn`. {why}"
+        raise InputError(text, argument="rate")
+    return found[0]
 
 
 def _noted(option: str, given: Sequence[str] | None) -> dict[str, str]:
@@ -138,7 +170,7 @@ def predict(
     *,
     scene: Scene = None,
     of: Axis = None,
-    how: Reading,
+    how: Timed,
     as_json: Annotated[
         bool, Option("--json", help="Print JSON, with the whole ranking; of many touches a line each.")
     ] = False,
@@ -149,9 +181,9 @@ def predict(
     Of many the exit code is 1 where some were refused.
     """
     from scroll_tactile.clients.learning.learning import answers
-    from scroll_tactile.clients.learning.sources import SourceOptions, find_sources
+    from scroll_tactile.clients.learning.sources import find_sources
 
-    options = SourceOptions(**vars(how))
+    options = how.taken()
     found, refused = find_sources(sources)
     alone = len(sources) == 1 and len(found) + len(refused) == 1 and not as_csv
     with opened(memory, mode="read") as learner:
@@ -169,22 +201,27 @@ def predict(
 
 
 def _show_answers(answered: Iterator[Answered | Refused], as_json: bool, as_csv: bool) -> list[Refused]:
-    """Print a line for each answer, as it comes; returns what was refused."""
+    """Print a line for each answer, as it comes, and what is odd at the end; returns what was refused."""
     from scroll_tactile.clients.learning.sources import Refused
+    from scroll_tactile.signals.facts import Fact, merged
 
-    refused = []
+    refused, facts = [], list[Fact]()
     if as_csv:
         say_csv(*ANSWER)
     for each in answered:
         if isinstance(each, Refused):
             refused.append(each)
-        elif as_csv:
+            continue
+        facts = merged([*facts, *each.touch.facts])
+        if as_csv:
             say_csv(*answer_row(each))
         elif as_json:
             say_json({"source": each.touch.source} | _answer(each))
         else:
             say(f"{shown(each.touch.source)}: {verdict(each.prediction)}")
             _say_estimates(each.estimates)
+    if not as_json:
+        say_facts(facts)
     return refused
 
 
@@ -193,10 +230,11 @@ def _show_answer(found: Answered | Refused, as_json: bool) -> None:
     from scroll_tactile.clients.learning.sources import Refused
 
     if isinstance(found, Refused):
-        raise InputError(found.why, argument=found.argument)
+        raise found.error()
     if as_json:
         say_json(_answer(found))
         return
+    say_facts(found.touch.facts)
     ranked = [f"  {percent(probability):>8}  {shown(name)}" for name, probability in found.prediction.ranking[:SHOWN]]
     say(f"{verdict(found.prediction)}, from {found.prediction.seconds:g} s of touch", *ranked)
     _say_estimates(found.estimates)
@@ -209,8 +247,8 @@ def _say_estimates(estimates: Mapping[str, Estimate], margin: str = "  ") -> Non
 
 def _answer(answered: Answered) -> dict[str, Any]:
     of = answered.prediction
-    ranked = {"seconds": of.seconds, "ranking": of.ranking_as_json()}
-    return of.as_json() | ranked | _measured(answered.estimates)
+    more = {"seconds": of.seconds, "ranking": of.ranking_as_json(), "facts": facts_as_json(answered.touch.facts)}
+    return of.as_json() | more | _measured(answered.estimates)
 
 
 def _measured(estimates: Mapping[str, Estimate]) -> dict[str, Any]:
@@ -298,13 +336,16 @@ def _constituent(text: str) -> tuple[str, float | bool | tuple[float, str] | Non
     return name.strip(), (share, unit.strip()) if unit else share
 
 
-def compose(memory: MemoryFolder, file: StreamFile, columns: Columns = None, as_json: AsJson = False) -> None:
+def compose(
+    memory: MemoryFolder, file: StreamFile, columns: Columns = None, rate: ByTimes = None, as_json: AsJson = False
+) -> None:
     """Say what a touch in a file feels made of, of all that was described; the memory stays as it is."""
     from scroll_tactile.recordings import read
 
     recording = read(file, columns=columns)
     with opened(memory, mode="read") as learner:
-        made_of = learner.compose(recording.stream(learner.sensor))
+        by: Any = None if rate is None else rate.value
+        made_of = learner.compose(recording.stream(learner.sensor, rate=by))
     if as_json:
         kept = ("presence", "share", "evidence", "unlearned")
         found = [{"constituent": of.name, **{name: getattr(of, name) for name in kept}} for of in made_of.constituents]
@@ -325,8 +366,8 @@ def live(
     file: Annotated[
         Path,
         Argument(
-            help="A .npy or .csv file of readings, a row each, or a bag; or - for lines of comma-separated numbers on "
-            "the standard input, as they come.",
+            help="A .npy or .csv file of readings, a row each, or a bag; or - for lines of numbers on the standard "
+            "input, as they come, with what a table has between them.",
             show_default=False,
         ),
     ],
@@ -341,21 +382,18 @@ def live(
     how: Reading,
 ) -> None:
     """Take readings as they come, find the touches, and show each answer grow; the memory stays as it is."""
-    from scroll_tactile.recordings.recording import places
-
     screen = console()
-    rows = _rows(file, timed, how)
-    if (columns := how.columns) is not None:
-        rows = ((time, reading[places(columns, reading.size)]) for time, reading in rows)
     growing, before = Live(console=screen, auto_refresh=False, transient=True), None
     with (
         opened(memory, mode="read") as learner,
         learner.live(risk=risk, contact="manual" if touch else "auto", of=of) as session,
         growing if screen.is_terminal and not as_json else nullcontext(),
     ):
+        lines = LiveLines(learner.sensor.channels, timed=timed, how=how)
+        rows = lines.readings() if str(file) == "-" else _replayed(file, timed, how)
         for now, at in _states(session, rows, touch):
             before = _shown(before, now, at, as_json, growing)
-    _summed_up(session.report, as_json, whole=touch)
+    _summed_up(session.report, as_json, whole=touch, left_out=lines.left_out)
 
 
 def _states(
@@ -372,32 +410,100 @@ def _states(
         yield session.end(), at
 
 
-def _rows(file: Path, timed: bool, how: Reading) -> Iterator[tuple[float | None, npt.NDArray[np.float64]]]:
-    """Readings, one after the other, with their times where these are there, as in bags, or were asked for."""
-    import numpy as np
-
+def _replayed(file: Path, timed: bool, how: Reading) -> Iterator[tuple[float | None, npt.NDArray[np.float64]]]:
+    """Readings of a file, with their times where these are there, as in bags, or were asked for."""
     from scroll_tactile.recordings import read
+    from scroll_tactile.recordings.recording import places
 
-    where = {name: value for name, value in vars(how).items() if name != "columns"}  # counted behind the time
-    if str(file) != "-":
-        recording = read(file, **where)
-        own = recording.report.clock is not None and (timed or recording.topic is not None)
-        for time, reading in zip(recording.times.tolist(), recording.readings, strict=True):
-            yield (time, reading) if own else _parted(reading, timed)  # a table names its times, or they come first
-        return
-    if named := [f"--{name} {value}" for name, value in where.items() if value is not None]:
-        raise InputError(
-            f"the standard input has readings alone; came {', '.join(named)}: leave that out, or give a file"
-        )
-    for number, line in enumerate(_lines(), start=1):
-        if not line.strip():
-            continue
-        try:
-            yield _parted(np.array([float(cell) for cell in line.split(",")]), timed)
-        except ValueError:
+    recording = read(file, **{**vars(how), "columns": None})  # which are counted behind the time
+    own = recording.report.clock is not None and (timed or recording.topic is not None)
+    for time, row in zip(recording.times.tolist(), recording.readings, strict=True):
+        # A table names its times, or they come first.
+        at, reading = (time, row) if own else (float(row[0]), row[1:]) if timed else (None, row)
+        yield at, reading if how.columns is None else reading[places(how.columns, reading.size)]
+
+
+class LiveLines:
+    """Readings out of lines of the standard input, written as tables are; others are left out, counted and told.
+
+    channels: of the sensor. timed: whether the first cell is a time; a header may name another.
+    Raises InputError for options that lines have no use for.
+    """
+
+    def __init__(self, channels: int, *, timed: bool, how: Reading) -> None:
+        from scroll_tactile.recordings.text import Layout
+
+        self.left_out = self.taken = self._width = 0
+        self._channels, self._how = channels, how
+        self._time, self._clock = 0 if timed else None, ""
+        self._layout: Layout | None = None
+        Layout.of([], how.delimiter, how.decimal)
+
+    def readings(self) -> Iterator[tuple[float | None, npt.NDArray[np.float64]]]:
+        """Each reading with its time. Raises InputError where a hundred lines, or all there are, have none."""
+        unfit = {name: value for name, value in vars(self._how).items() if value is not None}
+        for name in ("columns", "delimiter", "decimal"):
+            unfit.pop(name, None)
+        if named := [f"--{name} {value}" for name, value in unfit.items()]:
             raise InputError(
-                f"standard input, line {number}: expected numbers with commas between; came {line.strip()!r:.60}"
-            ) from None
+                f"the standard input has readings alone; came {', '.join(named)}: leave that out, or give a file"
+            )
+        error = None
+        for row, line in enumerate(_lines(), start=1):
+            try:
+                reading = self._reading(line) if line.strip() else None
+            except InputError as found:
+                error = InputError(f"standard input, line {row}: {found}", argument=found.argument)
+                self._leave_out(error)
+                continue
+            if reading is not None:
+                self.taken += 1
+                yield reading
+        if error is not None and not self.taken:
+            raise error
+
+    def _leave_out(self, error: InputError) -> None:
+        self.left_out += 1
+        if not self.taken and self.left_out == GIVEN_UP:
+            raise error
+        if set(str(self.left_out)) <= {"0", "1"} and str(self.left_out).count("1") == 1:  # 1, 10, 100 …
+            so_far = f"; {self.left_out} lines so far" if self.left_out > 1 else ""
+            console(error=True).print(f"[yellow]left out:[/] {shown(error)}{so_far}")
+
+    def _reading(self, line: str) -> tuple[float | None, npt.NDArray[np.float64]] | None:
+        """The time and the numbers of a line; None of a header. Raises InputError for other lines."""
+        import numpy as np
+
+        from scroll_tactile.recordings.recording import places
+        from scroll_tactile.recordings.text import Layout, in_seconds, is_time, moment, number
+
+        layout = self._layout or Layout.of([line.strip()], self._how.delimiter, self._how.decimal)
+        cells = layout.cells(line.strip("\n"))
+        wide = self._width or self._channels + (self._time is not None)
+        free = self._how.columns is not None and not self._width  # then the first line says how wide they are
+        if len(cells) > wide and not cells[-1].strip():
+            cells.pop()
+        values = [number(cell, layout.decimal) for cell in cells]
+        fits = len(cells) > self._channels if free else len(cells) in (wide, wide + 1)
+        if not self.taken and fits and set(values) == {None}:
+            named = (i for i, name in enumerate(cells) if is_time(name))
+            self._time = next(named, None) if self._time is None else self._time
+            self._clock = "" if self._time is None else cells[self._time]
+            return None
+        if len(cells) != wide and not free:
+            more = ". If the first is a time, add --timed; otherwise name some by --columns" * (len(cells) > wide)
+            raise InputError(f"expected {wide} numbers; came {line.strip()!r:.60}, {len(cells)} cells{more}")
+        at = None if self._time is None else moment(cells[self._time], layout.decimal)
+        if self._time is not None:
+            del values[self._time]
+            if at is None or not math.isfinite(at):
+                raise InputError(f"expected a time in cell {self._time + 1}; came {line.strip()!r:.60}")
+            at = float(in_seconds(np.array([at]), self._clock)[0]) if self._clock else at
+        chosen = values if self._how.columns is None else [values[i] for i in places(self._how.columns, len(values))]
+        if None in chosen or len(chosen) != self._channels:
+            raise InputError(f"expected {self._channels} numbers; came {line.strip()!r:.60}")
+        self._layout, self._width = layout, len(cells)
+        return at, np.array(chosen, np.float64)
 
 
 def _lines() -> Iterator[str]:
@@ -408,10 +514,6 @@ def _lines() -> Iterator[str]:
         if len(line) == LONGEST_LINE and not line.endswith("\n"):
             raise InputError(f"standard input: expected a line a reading, of less than {LONGEST_LINE} characters")
         yield line
-
-
-def _parted(row: npt.NDArray[np.float64], timed: bool) -> tuple[float | None, npt.NDArray[np.float64]]:
-    return (float(row[0]), row[1:]) if timed else (None, row)
 
 
 def _shown(before: LiveState | None, now: LiveState, at: float, as_json: bool, growing: Live) -> LiveState:
@@ -463,8 +565,8 @@ def _line(event: str, at: float, more: Mapping[str, Any]) -> None:
     say_json({"event": event, "at": round(at, 6), **more})
 
 
-def _summed_up(report: LiveReport, as_json: bool, *, whole: bool) -> None:
-    met = {name: count for name, count in vars(report).items() if count}
+def _summed_up(report: LiveReport, as_json: bool, *, whole: bool, left_out: int) -> None:
+    met = {name: count for name, count in {**vars(report), "left_out": left_out}.items() if count}
     if as_json:
         say_json({"event": "report", **met})
     if not report.touches and not whole:

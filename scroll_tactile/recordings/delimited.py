@@ -212,20 +212,23 @@ class Delimited(Text):
         sure = same[2 * len(same) // 3 :][-max(3, _MOST_COLUMNS // self.width) :]
         numeric = [2 * sum(number(c[i], point) is not None for c in sure) > len(sure) for i in range(self.width)]
         above: list[list[str]] = []
-        for self.begin, line, cells in rows:
+        for i, (self.begin, line, cells) in enumerate(rows):
             if line.startswith(("#", "%")) and len(cells) != self.width:
                 cells = self.layout.cells(line.lstrip("#% "))  # noqa: PLW2901
-            elif (above and not any(numeric)) or not (
-                self._heads(cells, numeric) if header is None else header and not above
-            ):
-                break
+            elif header is not None or (above and not any(numeric)):
+                if not header or above:
+                    break
+            elif not self._heads(cells, numeric):
+                odd = any(number(cell, point) is None for cell in cells)
+                if not (
+                    odd and any(self._heads(own, numeric) for _, _, own in rows[i + 1 : i + 4])
+                ):  # as in a preamble
+                    break
             above.append(cells)
         else:
             self.begin += 1
         data = [cells for row, _, cells in rows if row >= self.begin and self.width <= len(cells) <= self.width + 1]
-        named = [
-            cells for cells in above if len(cells) == self.width or (len(cells) == self.width + 1 and not cells[-1])
-        ]
+        named = [cells for cells in above if self.width <= len(cells) <= self.width + 1]
         if header is None and not named and data and self._counts(data):
             named, self.begin = [data.pop(0)], self.begin + 1
         units = next((cells for cells in named if len(named) > 1 and _are_units(cells)), None)

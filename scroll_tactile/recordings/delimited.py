@@ -13,9 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import FieldError, RecordingError, ScrollTactileError
-from scroll_tactile.recordings.blocks import Block, Contents, Entry, Request, rows_of
+from scroll_tactile.recordings.blocks import Block, Contents, Entry, Request, in_seconds, is_clock, rows_of
 from scroll_tactile.recordings.paths import nearest
-from scroll_tactile.recordings.text import FEWEST, LONGEST, Layout, Text, in_seconds, is_time, moment, number, usual
+from scroll_tactile.recordings.text import FEWEST, LONGEST, Layout, Text, moment, number, usual
 
 __all__ = ["LONGEST", "SUFFIXES", "Delimited"]
 
@@ -251,7 +251,7 @@ class Delimited(Text):
         for i, name in enumerate(self.columns if self.header else []):
             if name.lower() == "date":
                 apart.append(i)
-            elif is_time(name):
+            elif is_clock(name):
                 told = sum(moment(cells[i], self.layout.decimal) is not None for cells in own)
                 if self.time is None and 2 * told >= len(own):
                     self.time = i

@@ -16,14 +16,22 @@ from scroll_tactile.errors import ChannelCountError, InputError, RecordingError
 from scroll_tactile.recordings import presets
 from scroll_tactile.recordings.blocks import Block, Contents, Request, Source, guarded
 from scroll_tactile.recordings.bounds import require_file
+from scroll_tactile.recordings.decoding import definitions_of
 from scroll_tactile.recordings.locations import local
 from scroll_tactile.recordings.recording import Episode, Gap, Recording, Report, longest_step, only_columns, resampled
 
 __all__ = ["describe", "find", "iterate", "read"]
 
 _DEEPEST = 64  # folders within each other in which recordings are looked for
+_FAST, _BATCH, _LATE = (
+    0.002,
+    5,
+    0.95,
+)  # messages come in batches where the median step is below so many seconds, and the
+# latest twentieth of all steps are so many times as long: the pauses between batches are no gaps
 
 _Address = str | PathLike[str]
+_Definitions = Mapping[str, str] | str | PathLike[str] | None
 _Times = npt.NDArray[np.float64]
 
 
@@ -42,27 +50,31 @@ def read(
     header: bool | None = None,
     delimiter: str | None = None,
     decimal: str | None = None,
-    definitions: Mapping[str, str] | None = None,
+    definitions: _Definitions = None,
 ) -> Recording:
     """All readings of a file, or of a folder that is one recording.
 
-    path: a ROS 1 `.bag`; a ROS 2 `.db3` or `.mcap`, or the folder of a bag; a LeRobotDataset v3; robomimic's HDF5; a
-        Zarr replay buffer; `.npy`; `.csv`. Bags in a folder whose names differ in a last number alone are one that was
-        split. On this machine, or an address that fsspec knows.
-    topic, field: where the numbers are. Of messages `field` is a path such as `tactiles[0].electrodes`, see `paths`; of
-        tables it names columns (`e1:e19`, `e*`, `a,b`), of others an array, with an index behind it (`[0:19]`).
+    path: a ROS 1 `.bag`; a ROS 2 `.db3` or `.mcap`, or the folder of a bag; a LeRobotDataset v2 or v3; `.parquet`
+        and `.feather`; HDF5, as robomimic's; a Zarr replay buffer; `.npy`, `.npz` and `.mat`; tables of
+        text, `.csv`, `.tsv`, `.txt` and `.dat`; JSON and lines of JSON. Bags in a folder whose names differ in a last
+        number alone are one that was split. On this machine, or an address that fsspec knows.
+    topic, field: where the numbers are. Of messages and JSON `field` is a path such as `tactiles[0].electrodes`, see
+        `paths`; of tables it names columns (`e1:e19`, `e*`, `a,b`), of others an array, with an index behind it
+        (`[0:19]`); arrays that a pattern finds in several groups (`run/*/tactile`), and entries of a stack (`x[*]`),
+        are episodes, see `arraystores`.
     clock: "device", "header", "publish" or "log"; or a field, column or array with times. Without it the first of these
         that runs; see `Report`.
     columns: those of the readings that are taken, by their places from 0, such as "25:44" or "0,3,5:9".
     preset: a known sensor, in place of topic and field, see `presets`; of a file without topics it is only the sensor.
     rate: in Hz, counts times where a file has no clock.
-    labels: a topic with texts, or a column: what they say become episodes.
-    annotate: columns of a LeRobotDataset that say something of touches, as headings such as "force [N]" or
+    labels: a topic with texts, a column, or an array of one text, one an episode, or one a reading: they name episodes.
+    annotate: columns or arrays that say something of touches, as headings such as "force [N]" or
         "slip [label]", with " from observation.wrench[2]" behind it where the data set calls it otherwise; they become
         `annotations`.
     resample: a rate in Hz; see `resampled` for the rule. Readings are left as they are without it.
     header, delimiter, decimal: how a table is written, where it does not show.
-    definitions: of messages that a bag does not define, the text of the .msg by the type's name.
+    definitions: of messages that a bag does not define, a folder of .msg files (`package/msg/Name.msg`, or flat), or
+        their texts by the types' names. Presets bring those of their drivers.
 
     Raises FieldError where topic or field are not there or not given, listing what there is; RecordingError where the
     file is not there, damaged, ragged, empty, of no known format, or claims to hold more than one of its size can (see
@@ -70,7 +82,17 @@ def read(
     of another sensor; InputError for a clock that is not there.
     """
     request = Request(
-        topic, field, clock, rate, labels, header, delimiter, decimal, None, definitions or {}, tuple(annotate)
+        topic,
+        field,
+        clock,
+        rate,
+        labels,
+        header,
+        delimiter,
+        decimal,
+        None,
+        definitions_of(definitions),
+        tuple(annotate),
     )
     address = fspath(path)
     with local(address) as place, guarded(address):
@@ -94,14 +116,16 @@ def iterate(
     header: bool | None = None,
     delimiter: str | None = None,
     decimal: str | None = None,
-    definitions: Mapping[str, str] | None = None,
+    definitions: _Definitions = None,
 ) -> Iterator[Recording]:
     """The readings of a file block by block, as recordings of at most 4096 readings: for files beyond memory.
 
     Arguments and errors are those of `read`. Blocks come in the order of the file, and each has the report of its own
     readings; the clock is chosen from the first.
     """
-    request = Request(topic, field, clock, rate, labels, header, delimiter, decimal, definitions=definitions or {})
+    request = Request(
+        topic, field, clock, rate, labels, header, delimiter, decimal, definitions=definitions_of(definitions)
+    )
     address = fspath(path)
     with local(address) as place:
         with guarded(address):
@@ -118,14 +142,14 @@ def iterate(
             yield recording
 
 
-def describe(path: _Address, *, definitions: Mapping[str, str] | None = None) -> Contents:
+def describe(path: _Address, *, definitions: _Definitions = None) -> Contents:
     """What a file has: its topics and fields with their shapes and rates, and a line to copy.
 
     Of a bag the first 2000 messages are looked at. Raises RecordingError as `read` does.
     """
     address = fspath(path)
     with local(address) as place, guarded(address):
-        return _open(place, address, Request(definitions=definitions or {})).contents()
+        return _open(place, address, Request(definitions=definitions_of(definitions))).contents()
 
 
 def find(path: _Address) -> list[Path]:
@@ -169,8 +193,8 @@ def _open(path: Path, address: str, request: Request, preset: str | None = None)
     if kind is None:
         what = "a folder that is none of these" if path.is_dir() else repr(path.name)
         raise RecordingError(
-            "expected a recording: .bag, .db3, .mcap, .npy, .csv, .h5, .zarr, the folder of a ROS 2 bag with its "
-            f"metadata.yaml, or of a LeRobot data set; came {what} at {address}"
+            "expected a recording: .bag, .db3, .mcap, .npy, .npz, .mat, .csv, .json, .parquet, .feather, .h5, .zarr, "
+            f"the folder of a ROS 2 bag with its metadata.yaml, or of a LeRobot data set; came {what} at {address}"
         )
     if not path.is_dir():
         require_file(path)
@@ -184,7 +208,7 @@ def _open(path: Path, address: str, request: Request, preset: str | None = None)
             )
     if request.annotate and not source.annotate:
         raise InputError(
-            f"{address} has no columns to annotate touches by; expected a LeRobot data set; came "
+            f"{address} has no columns to annotate touches by; expected arrays; came "
             f"annotate={request.annotate[0]!r}: give values and labels in a table of intervals=",
             argument="annotate intervals",
         )
@@ -192,22 +216,22 @@ def _open(path: Path, address: str, request: Request, preset: str | None = None)
 
 
 def _kind(path: Path) -> type[Source] | None:
-    from scroll_tactile.recordings import arraystores, delimited, jsonfile, lerobot, rosbag, zarrfile
+    from scroll_tactile.recordings import arraystores, columnar, delimited, jsonfile, rosbag, zarrfile
 
     if rosbag.is_rosbag(path):
         return rosbag.RosBag
-    if path.is_dir() and lerobot.is_lerobot(path):
-        return lerobot.LeRobot
+    if path.is_dir() and columnar.is_lerobot(path):
+        return columnar.LeRobot
     if zarrfile.is_zarr(path):
-        return arraystores.ZarrBuffer
+        return zarrfile.ZarrBuffer
     suffix = "" if path.is_dir() else path.suffix.lower()
-    readers: dict[type[Source], tuple[str, ...]] = {
-        arraystores.Hdf5: (".h5", ".hdf5", ".hdf"),
-        arraystores.Npy: (".npy",),
-        delimited.Delimited: delimited.SUFFIXES,
-        jsonfile.JsonFile: jsonfile.SUFFIXES,
-    }
-    return next((reader for reader, suffixes in readers.items() if suffix in suffixes), None)
+    kinds: dict[str, type[Source]] = {".npy": arraystores.Npy, ".npz": arraystores.Npz, ".mat": arraystores.Mat}
+    kinds |= dict.fromkeys((".h5", ".hdf5", ".hdf"), arraystores.Hdf5)
+    kinds |= dict.fromkeys((".parquet", ".feather"), columnar.Columnar)
+    kinds |= dict.fromkeys(delimited.SUFFIXES, delimited.Delimited) | dict.fromkeys(
+        jsonfile.SUFFIXES, jsonfile.JsonFile
+    )
+    return kinds.get(suffix)
 
 
 def _timed(source: Source, request: Request) -> Iterator[Block]:
@@ -256,8 +280,15 @@ def _recording(block: Block, source: Source, clock: str | None, columns: str | N
     readings, times, episodes, report = assemble(block, clock, source)
     report = replace(report, cut_off=source.cut_off, notes=tuple(source.notes))
     within = source.address, source.topic, source.field()
-    recording = Recording(*within, readings, times, episodes, report, block.annotations)
+    recording = Recording(*within, readings, times, episodes, report, block.annotations, _names(source, readings))
     return recording if columns is None else only_columns(recording, columns)
+
+
+def _names(source: Source, readings: npt.NDArray[Any]) -> tuple[str, ...]:
+    """The names of a table's columns, as its field lists them; none where there are none, or numbers for them."""
+    names = tuple(name.strip() for name in source.field().split(","))
+    own = not source.topics and readings.ndim == 2 and 1 < len(names) == len(set(names)) == readings.shape[1]
+    return names if own and not all(name.isdigit() for name in names) else ()
 
 
 def _clock(block: Block, requested: str | None) -> str | None:
@@ -322,18 +353,35 @@ def assemble(
         readings = readings[order]
         clocks = {name: times[order] for name, times in clocks.items()}
         counters = {name: counts[order] for name, counts in counters.items()}
-    episodes = _spans(clocks["log"], source.marks) if source.marks else _numbered(block.episodes, source.names)
+    episodes = _spans(clocks["log"], source.marks) if source.marks else _numbered(block.episodes, source)
     begins = [] if source.marks or source.continuous else [episode.begin for episode in episodes if episode.begin]
-    times = np.full(len(readings), np.nan) if clock is None else clocks[clock]
+    times = np.full(len(readings), np.nan) if clock is None else unwrapped(clocks[clock])
     unset = int(np.count_nonzero(clocks["header"] == 0)) if "header" in clocks else 0
-    return readings, times, episodes, _report(times, clock, counters, np.array(begins, np.int64), unset)
+    return readings, times, episodes, reported(times, clock, counters, np.array(begins, np.int64), unset)
 
 
-def _numbered(numbers: npt.NDArray[np.int64] | None, names: dict[int, str]) -> tuple[Episode, ...]:
+def unwrapped(times: _Times) -> _Times:
+    """Times of a counter of 16 or 32 bits, of s, ms, µs or ns, that goes on from 0 when it is full: as if it had more.
+
+    >>> unwrapped(np.array([65.534, 65.535, 0.0, 0.001])).round(3).tolist()
+    [65.534, 65.535, 65.536, 65.537]
+    """
+    steps = np.diff(times)
+    back = np.flatnonzero(steps < 0)
+    if len(back) and (steps > 0).any():
+        middle = float(np.median(steps[steps > 0]))
+        for period in (2.0**bits / unit for bits in (16, 32) for unit in (1, 1e3, 1e6, 1e9)):
+            if (abs(steps[back] + period - middle) <= _BATCH * middle).all() and times.max() < period:
+                return times + period * np.concatenate([[0], np.cumsum(steps < 0)])
+    return times
+
+
+def _numbered(numbers: npt.NDArray[np.int64] | None, source: Source) -> tuple[Episode, ...]:
     if numbers is None:
         return ()
     borders = [0, *(np.flatnonzero(np.diff(numbers)) + 1).tolist(), len(numbers)]
-    return tuple(Episode(begin, end, names.get(int(numbers[begin]))) for begin, end in itertools.pairwise(borders))
+    spans = [(begin, end, int(numbers[begin])) for begin, end in itertools.pairwise(borders)]
+    return tuple(Episode(begin, end, source.names.get(n), source.paths.get(n, "")) for begin, end, n in spans)
 
 
 def _spans(logged: npt.NDArray[np.float64], marks: list[tuple[float, str]]) -> tuple[Episode, ...]:
@@ -348,36 +396,45 @@ def _spans(logged: npt.NDArray[np.float64], marks: list[tuple[float, str]]) -> t
     return tuple(Episode(begin, end, text) for begin, end, (_, text) in spans if text and end > begin)
 
 
-def _report(
-    times: npt.NDArray[np.float64],
+def reported(
+    times: _Times,
     clock: str | None,
-    counters: dict[str, npt.NDArray[np.int64]],
+    counters: Mapping[str, npt.NDArray[np.int64]],
     borders: npt.NDArray[np.int64],
     unset: int,
 ) -> Report:
+    """What times and counters say of readings. borders: the readings before which time begins anew."""
     inside = np.ones(max(len(times) - 1, 0), bool)
     inside[borders - 1] = False
     missing, repeated = _lost(counters, borders)
     report = Report(len(times), clock, lost=missing, unset=unset)
-    steps = np.diff(times)
-    if not (np.isfinite(steps) & inside).any():
-        return replace(report, repeated=repeated)
-    steps[~inside] = np.nan
+    steps = np.where(inside, np.diff(times), np.nan)
     forward = steps[steps > 0]
+    if not np.isfinite(steps).any():
+        return replace(report, repeated=repeated)
+    again = int(np.count_nonzero(steps == 0))
     middle = float(np.median(forward)) if len(forward) else 0.0
-    longest = longest_step(middle)
+    late = float(np.nanquantile(steps, _LATE))
+    batches = middle < _FAST and late > _BATCH * middle
+    longest = longest_step(late if batches else middle)
     regular = forward[forward <= min(longest, 2 * middle)]
+    counted = forward[(forward >= middle / 2) & (forward <= 1.5 * middle)]
+    if batches or again > len(forward):  # from the first batch, or the first new stamp, to the last
+        begins = np.flatnonzero((steps > (_BATCH * middle if batches else 0)) & (steps <= longest))
+        counted = steps[begins[0] + 1 : begins[-1] + 1] if len(begins) > 1 else steps
+        counted = counted[(counted >= 0) & (counted <= longest)]
+    seconds = float(counted.sum())
     return replace(
         report,
-        rate=1 / middle if middle > 0 else None,
+        rate=len(counted) / seconds if seconds > 0 else None,
         jitter=float(regular.std()) if len(regular) else None,
         gaps=tuple(Gap(int(i) + 1, float(steps[i])) for i in np.flatnonzero(steps > longest)),
-        repeated=repeated or int(np.count_nonzero(steps == 0)),
-        backward=int(np.count_nonzero(steps < 0)),
+        repeated=repeated or again,
+        back=tuple(Gap(int(i) + 1, -float(steps[i])) for i in np.flatnonzero(steps < 0)),
     )
 
 
-def _lost(counters: dict[str, npt.NDArray[np.int64]], borders: npt.NDArray[np.int64]) -> tuple[int | None, int]:
+def _lost(counters: Mapping[str, npt.NDArray[np.int64]], borders: npt.NDArray[np.int64]) -> tuple[int | None, int]:
     """Lost and repeated readings by the device's counter, or else by the recorder's, if it counts each topic alone."""
     single = {name: int(np.count_nonzero(np.diff(counts) == 1)) for name, counts in counters.items()}
     for name in ("message", "sequence"):

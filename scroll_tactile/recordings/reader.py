@@ -225,13 +225,16 @@ def _kind(path: Path) -> type[Source] | None:
     if zarrfile.is_zarr(path):
         return zarrfile.ZarrBuffer
     suffix = "" if path.is_dir() else path.suffix.lower()
-    kinds: dict[str, type[Source]] = {".npy": arraystores.Npy, ".npz": arraystores.Npz, ".mat": arraystores.Mat}
-    kinds |= dict.fromkeys((".h5", ".hdf5", ".hdf"), arraystores.Hdf5)
-    kinds |= dict.fromkeys((".parquet", ".feather"), columnar.Columnar)
-    kinds |= dict.fromkeys(delimited.SUFFIXES, delimited.Delimited) | dict.fromkeys(
-        jsonfile.SUFFIXES, jsonfile.JsonFile
-    )
-    return kinds.get(suffix)
+    readers: dict[type[Source], tuple[str, ...]] = {
+        arraystores.Hdf5: (".h5", ".hdf5", ".hdf"),
+        arraystores.Npy: (".npy",),
+        arraystores.Npz: (".npz",),
+        arraystores.Mat: (".mat",),
+        columnar.Columnar: (".parquet", ".feather"),
+        delimited.Delimited: delimited.SUFFIXES,
+        jsonfile.JsonFile: jsonfile.SUFFIXES,
+    }
+    return next((reader for reader, suffixes in readers.items() if suffix in suffixes), None)
 
 
 def _timed(source: Source, request: Request) -> Iterator[Block]:

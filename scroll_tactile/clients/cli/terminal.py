@@ -94,14 +94,14 @@ class Reading:
     field: Annotated[str | None, Option(help="The path to the numbers, such as 'tactiles[0].electrodes'.")] = None
     clock: Annotated[str | None, Option(help="device, header, publish or log; or a field, column or array.")] = None
     columns: Columns = None
+    definitions: Annotated[
+        Path | None, Option(help="A folder of .msg files, for a bag that does not define its messages.")
+    ] = None
     delimiter: Annotated[
         str | None, Option(help="What separates the cells of a table, such as ';' or tab, where it does not show.")
     ] = None
     decimal: Annotated[
         str | None, Option(help="The decimal mark of a table's numbers, '.' or ',', where it does not show.")
-    ] = None
-    definitions: Annotated[
-        Path | None, Option(help="A folder of .msg files, for a bag that does not define its messages.")
     ] = None
 
 

@@ -65,7 +65,8 @@ class WriterLock:
     def _refusal(self) -> str:
         try:
             holder = json.loads(read_regular(self._folder / HOLDER_FILE, LARGEST_NOTE))
-            who = f"process {holder['pid']} on {holder['host']} since {holder['since']}"
+            ours = "this process, " if (holder["pid"], holder["host"]) == (os.getpid(), socket.gethostname()) else ""
+            who = f"{ours}process {holder['pid']} on {holder['host']} since {holder['since']}"
         except (OSError, ValueError, TypeError, KeyError, RecursionError, DamageError):
             # The holder writes the note just after it takes the lock and removes it just before it releases it.
             who = "a process that left no note of itself"

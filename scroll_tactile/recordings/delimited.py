@@ -220,11 +220,9 @@ class Delimited(Text):
                 if not header or above:
                     break
             elif not self._heads(cells, numeric):
-                odd = any(number(cell, point) is None for cell in cells)
-                if not (
-                    odd and any(self._heads(own, numeric) for _, _, own in rows[i + 1 : i + 4])
-                ):  # as in a preamble
-                    break
+                texts = any(number(cell, point) is None for cell in cells)
+                if not texts or not any(self._heads(own, numeric) for _, _, own in rows[i + 1 : i + 4]):
+                    break  # unless it is in a preamble, which goes on behind it
             above.append(cells)
         else:
             self.begin += 1
@@ -238,8 +236,8 @@ class Delimited(Text):
         self.units = (units or [""] * self.width)[: self.width]
         self.columns = [self.named(name) for name in (names or map(str, range(self.width)))][: self.width]
         self.columns[0] = self.columns[0].lstrip("#% ")
-        if odd := len(above) - len(named):
-            self.notes.append(f"{odd} rows above the numbers name no column")
+        if others := len(above) - len(named):
+            self.notes.append(f"{others} rows above the numbers name no column")
         self._assign(data, numeric)
 
     def _assign(self, data: list[list[str]], numeric: list[bool]) -> None:

@@ -50,7 +50,7 @@ class JsonFile(Text):
         several = path.suffix.lower() != ".json" or any(line.strip() for line in more)
         self.by_line = several and first.strip() not in ("[", "{") and any(map(_is_whole, (first, *more[:2])))
         self.path_to, self.clock, self.width = (request.field or "").strip(), request.clock, 0
-        self.paths: dict[str, FieldPath] = {}
+        self.compiled: dict[str, FieldPath] = {}
 
     @classmethod
     def holds_some(cls, path: Path) -> bool:
@@ -121,6 +121,7 @@ class JsonFile(Text):
                     label = name if self.request.labels is None else self._found(message, self.request.labels)[0]
                     if several and (f"{row} {place}" if place else "", label) != before:
                         before, number, index = (f"{row} {place}" if place else "", label), number + 1, 0
+                        self.paths[number] = place.replace(".", "/")
                         self.names |= {number: self.named(label)} if isinstance(label, str) and label.strip() else {}
                     yield (*taken, number, index)
                     index += 1
@@ -156,9 +157,9 @@ class JsonFile(Text):
             return [message]
         if isinstance(message, dict) and path in message:
             return [message[path]]
-        if path not in self.paths:
-            self.paths[path] = FieldPath(path)
-        return self.paths[path].values(message)
+        if path not in self.compiled:
+            self.compiled[path] = FieldPath(path)
+        return self.compiled[path].values(message)
 
     def _leads(self, place: str, rows: list[Any]) -> bool:
         """Whether the field leads to something in a list's elements, or is the place of a list of numbers."""

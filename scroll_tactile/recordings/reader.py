@@ -46,9 +46,10 @@ def read(
 ) -> Recording:
     """All readings of a file, or of a folder that is one recording.
 
-    path: a ROS 1 `.bag`; a ROS 2 `.db3` or `.mcap`, or the folder of a bag; a LeRobotDataset v2 or v3; `.parquet`
-        and `.feather`; HDF5, as robomimic's; a Zarr replay buffer; `.npy`, `.npz` and `.mat`; `.csv`. Bags in a folder whose names differ in a last number alone are one that was
-        split. On this machine, or an address that fsspec knows.
+    path: a ROS 1 `.bag`; a ROS 2 `.db3` or `.mcap`, or the folder of a bag; a LeRobotDataset v2 or v3; `.parquet` and
+        `.feather`; HDF5, as robomimic's; a Zarr replay buffer; `.npy`, `.npz` and `.mat`; `.csv`. Bags in a folder
+        whose names differ in a last number alone are one that was split. On this machine, or an address that fsspec
+        knows.
     topic, field: where the numbers are. Of messages `field` is a path such as `tactiles[0].electrodes`, see `paths`; of
         tables it names columns (`e1:e19`, `e*`, `a,b`), of others an array, with an index behind it (`[0:19]`); arrays
         that a pattern finds in several groups (`run/*/tactile`), and entries of a stack (`x[*]`), are episodes, see

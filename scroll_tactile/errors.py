@@ -29,7 +29,8 @@
     ├── FineTuneError                        a fine-tune had to stop: the f* before it stays
     └── CapacityError (OverflowError)        exact sums would overflow: merge no more, start a new memory
 
-    RangeWarning (UserWarning)               what is learned lies outside a sensor's range, or in a corner of it
+    FactWarning (UserWarning)                what is odd about readings, and what to do; they are taken all the same
+    └── RangeWarning                         they lie outside the sensor's range, or in a corner of it
 
 A message says what was expected, what came, where, and what to do about it; it is written where it is raised.
 """
@@ -182,11 +183,19 @@ class CapacityError(ScrollTactileError, OverflowError):
     """An exact sum would not fit its integers any more."""
 
 
-class RangeWarning(UserWarning):
-    """Most of a touch's values lie outside the range of the sensor, or all in a corner of it.
+class FactWarning(UserWarning):
+    """Something is odd about readings that are taken all the same; the message says what to do about it.
 
-    Said once a learner, and once a fleet's run.
+    Said once a learner, and once a run over many files, with their number. argument: as of a `ScrollTactileError`.
     """
+
+    def __init__(self, *message: object, argument: str | None = None) -> None:
+        super().__init__(*message)
+        self.argument = argument
 
     def __str__(self) -> str:
         return printable(super().__str__(), keep="\n")
+
+
+class RangeWarning(FactWarning):
+    """Many of a touch's values lie outside the range of the sensor, or all in a corner of it."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
@@ -16,7 +15,7 @@ import numpy.typing as npt
 
 from scroll_tactile.arguments import require_arguments, silent
 from scroll_tactile.embeddings.protocol import Embedding
-from scroll_tactile.errors import AnnotationError, DescriptionError, InputError, RangeWarning
+from scroll_tactile.errors import AnnotationError, DescriptionError, InputError
 from scroll_tactile.health.channel_numbers import MOST_CHANNELS, has_numbers
 from scroll_tactile.health.watch import WatchRules
 from scroll_tactile.memory.descriptions import Description, checked
@@ -47,7 +46,7 @@ from scroll_tactile.results import (
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.settings import Settings, names_of, require_name, require_source
 from scroll_tactile.signals.correction import corrected_stream
-from scroll_tactile.signals.ranges import range_problem
+from scroll_tactile.signals.facts import Fact, judged, name_fact, touch_facts, warn_of
 from scroll_tactile.signals.stream import Stream, validate
 from scroll_tactile.signals.windows import WindowPlan
 from scroll_tactile.statistics.annotations import NO_ANNOTATION, Annotation
@@ -100,7 +99,7 @@ class TactileLearner:
         self._set_up(Predictor.new(RecipeRequest.of(sensor, embedding, settings).recipe()))
 
     def _set_up(self, predictor: Predictor, snapshot_of: str | None = None) -> None:
-        self._predictor, self._snapshot_of, self._range_warned = predictor, snapshot_of, False
+        self._predictor, self._snapshot_of, self._said = predictor, snapshot_of, set[tuple[str, str]]()
 
     @classmethod
     def open(
@@ -252,8 +251,8 @@ class TactileLearner:
 
         Raises StreamError (NoContactError where the gel was not pressed), MaterialError or InputError for a name or a
         source that is none, AnnotationError for a value that is none of its quantity, or other values or labels than
-        the memory has of this touch (nothing was kept), CapacityError, or StoreError. Warns once, by a RangeWarning,
-        where a touch does not fit the sensor's range; it is learned all the same.
+        the memory has of this touch (nothing was kept), CapacityError, or StoreError. Warns by a FactWarning, once of
+        each kind, of what is odd about a touch or its name (see `signals.facts.RULES`); it is learned all the same.
         """
         material, source = require_name(material), None if source is None else require_source(source)
         predictor = self._predictor  # one: `reembed` puts another in its place
@@ -261,12 +260,29 @@ class TactileLearner:
         predictor.extractor.verified()
         touch = predictor.stream(stream)
         learned = predictor.extractor.learned(touch)
+        facts = self._facts_of(touch, material)
         receipt = predictor.ledger.observe(material, touch, *learned, source, noted)
         predictor.prepare()
-        if not self._range_warned and (problem := range_problem(touch)) is not None:
-            self._range_warned = True
-            warnings.warn(problem, RangeWarning, stacklevel=2)
+        for fact in facts:
+            if (fact.kind, fact.about) not in self._said:
+                self._said.add((fact.kind, fact.about))
+                warn_of(fact)
         return receipt
+
+    def _facts_of(self, stream: Readings, material: str | None = None, *, source: str = "") -> list[Fact]:
+        """What is odd about a touch, see `signals.facts.RULES`, and about the name that it is to be learned under.
+
+        Raises as `stream` does, and StoreError.
+        """
+        touch = self.stream(stream)
+        facts = touch_facts(touch if touch.raw is None else touch.raw, source)
+        if material is not None:
+            facts += name_fact(material, self.materials)
+            others = [name for name in self.names_of(touch) if name != material]
+            facts += judged(
+                "known", len(others), source, about=f"{material}\n{touch.key.hex()}", other=(*others, "")[0]
+            )
+        return facts
 
     @contextmanager
     def batch(self) -> Iterator[None]:

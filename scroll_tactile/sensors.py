@@ -10,12 +10,22 @@ Five sensors come with the project, and another is made in one line. Presets of 
 """
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    model_serializer,
+    model_validator,
+)
 
 from scroll_tactile.errors import InputError
 
@@ -39,10 +49,13 @@ class Sensor(BaseModel):
     duration: how long a touch usually lasts, in seconds. Streams may be shorter or longer.
     layout: how the channels lie on the sensor, such as (6, 10) patches × taxels; its product is `channels`.
     camera: whether a reading is a picture; then layout is (height, width, 3).
+    columns: what the channels are called in tables, where that is known: tables that call them so are read in this
+        order. It tells no sensors apart.
     non_finite: whether streams with NaN or ±infinity are "refused", or these values are taken as "missing": then
         `validate` interpolates them, see `Stream.mask`.
 
-    Raises pydantic.ValidationError, which is a ValueError, for fields that do not fit together.
+    Raises InputError, which is a ValueError, for fields that are missing or do not fit together; pydantic's own error,
+    a ValueError, too, where a model is validated or changed.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -57,16 +70,40 @@ class Sensor(BaseModel):
     layout: tuple[Annotated[int, Field(ge=1)], ...] | None = None
     camera: bool = False
     non_finite: Literal["refused", "missing"] = "refused"
+    columns: tuple[str, ...] | None = None
+
+    def __init__(self, **fields: Any) -> None:
+        try:
+            super().__init__(**fields)
+        except ValidationError as error:
+            raise InputError(_wrong(error, fields)) from None
+
+    __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]  # a model in another is validated as it was
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Sensor):
+            return NotImplemented
+        return self is other or {**vars(self), "columns": None} == {**vars(other), "columns": None}
+
+    def __hash__(self) -> int:
+        return hash((self.name, self.channels, self.rate, self.low, self.high, self.duration))
+
+    @model_serializer(mode="wrap")
+    def _without_unknown_names(self, serialized: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        fields: dict[str, Any] = serialized(self)
+        if fields.get("columns", ()) is None:
+            del fields["columns"]
+        return fields
 
     @model_validator(mode="after")
     def _one_for_all_or_one_each(self) -> Self:
-        for field in ("low", "high", "unit"):
+        for field in ("low", "high", "unit", "columns"):
             value = getattr(self, field)
             if isinstance(value, tuple) and len(value) != self.channels:
                 raise ValueError(
                     f"{field} has {len(value)} entries for {self.channels} channels: give one, or one each"
                 )
-            if isinstance(value, tuple) and self.camera:
+            if isinstance(value, tuple) and self.camera and field != "columns":
                 raise ValueError(f"a camera has one {field} for all its pixels; {field} has {len(value)} entries")
         return self
 
@@ -204,6 +241,24 @@ def read_sensor(text: str) -> Sensor:
         raise InputError(f"expected a sensor, one of {', '.join(presets)}, or a JSON file of its fields; came {text!r}")
     try:
         return Sensor.model_validate_json(path.read_text(encoding="utf-8"))
-    except (ValueError, OSError) as error:  # pydantic's errors are ValueErrors, of a line for each field
-        what = "; ".join(line.strip() for line in str(error).splitlines() if not line.strip().startswith("For further"))
-        raise InputError(f"{path} does not describe a sensor: {what}") from error
+    except ValidationError as error:
+        raise InputError(f"{path} does not describe a sensor: {_wrong(error, {})}") from error
+    except (ValueError, OSError) as error:
+        raise InputError(f"{path} cannot be read as a sensor's: {error}") from error
+
+
+def _wrong(error: ValidationError, fields: Mapping[str, Any]) -> str:
+    """What is wrong with the fields of a sensor, in one sentence."""
+    found = error.errors(include_url=False)
+    lacking = [str(each["loc"][0]) for each in found if each["type"] == "missing"]
+    wrong = [
+        f"{'.'.join(map(str, each['loc']))}{': ' * bool(each['loc'])}{each['msg'].removeprefix('Value error, ')}"
+        + f"; came {each['input']!r:.60}" * bool(each["loc"])
+        for each in found
+        if each["type"] != "missing"
+    ]
+    if lacking:
+        whose = f"sensor {fields['name']!r:.60}" if "name" in fields else "a sensor"
+        given = f"{', '.join(lacking[:-1])} and {lacking[-1]}" if len(lacking) > 1 else lacking[0]
+        wrong.append(f"{whose} needs {given}, too: `scroll-tactile sensor FILES` guesses them from recordings of it")
+    return "; ".join(wrong)

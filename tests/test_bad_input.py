@@ -151,7 +151,7 @@ def test_a_touch_of_nothing_finite_or_of_one_reading_is_refused(learner):
     assert learner.digest() == before
 
 
-@pytest.mark.filterwarnings("ignore::scroll_tactile.errors.RangeWarning")  # some are far outside
+@pytest.mark.filterwarnings("ignore::scroll_tactile.errors.FactWarning")  # some are far outside
 def test_unusual_touches_are_learned_and_no_answer_suffers():
     made, kinds = learned(GAPPED, of_each=2), SOUND | NOT_FINITE
     for kind, spoil in kinds.items():

@@ -85,6 +85,24 @@ def test_what_does_not_fit_is_refused_with_the_reason(change, message):
         Sensor(**(FIELDS | change))
 
 
+def test_fields_that_are_missing_are_named_in_one_sentence():
+    with pytest.raises(InputError) as met:
+        Sensor(name="x")
+    assert str(met.value) == (
+        "sensor 'x' needs channels, rate, low, high, unit and duration, too: `scroll-tactile sensor FILES` guesses "
+        "them from recordings of it"
+    )
+
+
+def test_names_of_columns_tell_no_sensors_apart_and_are_kept():
+    skin, named = Sensor(**FIELDS), Sensor(**FIELDS, columns=list("abcdef"))
+    assert skin == named and hash(skin) == hash(named)
+    assert Sensor.model_validate_json(named.model_dump_json()).columns == tuple("abcdef")
+    assert "columns" not in skin.model_dump()
+    with pytest.raises(InputError, match="columns has 2 entries for 6 channels"):
+        Sensor(**FIELDS, columns=("a", "b"))
+
+
 MIXED = Sensor(
     name="imu", channels=2, rate=50.0, low=(-1.0, 0.0), high=(1.0, 1000.0), unit=("rad/s", "mV"), duration=1.0
 )
@@ -117,13 +135,13 @@ def test_a_sensor_that_misses_values_says_so_in_json():
     for sensor in (skin, missing):
         assert Sensor.model_validate_json(sensor.model_dump_json()) == sensor
     assert missing != skin
-    with pytest.raises(ValidationError, match="'refused' or 'missing'"):
+    with pytest.raises(InputError, match="'refused' or 'missing'"):
         Sensor(**FIELDS, non_finite="ignored")
 
 
 def test_a_camera_has_one_range():
     fields = {"name": "eye", "channels": 12, "rate": 5.0, "high": 1.0, "unit": "1", "duration": 1.0, "camera": True}
-    with pytest.raises(ValidationError, match="a camera has one low for all its pixels"):
+    with pytest.raises(InputError, match="a camera has one low for all its pixels"):
         Sensor(**fields, layout=(2, 2, 3), low=(0.0,) * 12)
 
 

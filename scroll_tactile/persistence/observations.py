@@ -17,7 +17,7 @@ from scroll_tactile.memory.state import MOST_CORRECTIONS, Memory
 from scroll_tactile.memory.touch_rows import Kind, active_rows, annotation_of, declared_by, retracted_by
 from scroll_tactile.persistence.ram_store import AnyStore
 from scroll_tactile.results import Adaptation, Observation, Receipt
-from scroll_tactile.signals.ranges import CURE
+from scroll_tactile.signals.facts import CURE
 from scroll_tactile.statistics.annotations import Annotation
 
 __all__ = [

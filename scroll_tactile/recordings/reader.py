@@ -16,14 +16,22 @@ from scroll_tactile.errors import ChannelCountError, InputError, RecordingError
 from scroll_tactile.recordings import presets
 from scroll_tactile.recordings.blocks import Block, Contents, Request, Source, guarded
 from scroll_tactile.recordings.bounds import require_file
+from scroll_tactile.recordings.decoding import definitions_of
 from scroll_tactile.recordings.locations import local
 from scroll_tactile.recordings.recording import Episode, Gap, Recording, Report, longest_step, only_columns, resampled
 
 __all__ = ["describe", "find", "iterate", "read"]
 
 _DEEPEST = 64  # folders within each other in which recordings are looked for
+_FAST, _BATCH, _LATE = (
+    0.002,
+    5,
+    0.95,
+)  # messages come in batches where the median step is below so many seconds, and the
+# latest twentieth of all steps are so many times as long: the pauses between batches are no gaps
 
 _Address = str | PathLike[str]
+_Definitions = Mapping[str, str] | str | PathLike[str] | None
 _Times = npt.NDArray[np.float64]
 
 
@@ -42,7 +50,7 @@ def read(
     header: bool | None = None,
     delimiter: str | None = None,
     decimal: str = ".",
-    definitions: Mapping[str, str] | None = None,
+    definitions: _Definitions = None,
 ) -> Recording:
     """All readings of a file, or of a folder that is one recording.
 
@@ -65,7 +73,8 @@ def read(
         `annotations`.
     resample: a rate in Hz; see `resampled` for the rule. Readings are left as they are without it.
     header, delimiter, decimal: how a table is written, where it does not show.
-    definitions: of messages that a bag does not define, the text of the .msg by the type's name.
+    definitions: of messages that a bag does not define, a folder of .msg files (`package/msg/Name.msg`, or flat), or
+        their texts by the types' names. Presets bring those of their drivers.
 
     Raises FieldError where topic or field are not there or not given, listing what there is; RecordingError where the
     file is not there, damaged, ragged, empty, of no known format, or claims to hold more than one of its size can (see
@@ -73,7 +82,17 @@ def read(
     of another sensor; InputError for a clock that is not there.
     """
     request = Request(
-        topic, field, clock, rate, labels, header, delimiter, decimal, None, definitions or {}, tuple(annotate)
+        topic,
+        field,
+        clock,
+        rate,
+        labels,
+        header,
+        delimiter,
+        decimal,
+        None,
+        definitions_of(definitions),
+        tuple(annotate),
     )
     address = fspath(path)
     with local(address) as place, guarded(address):
@@ -97,14 +116,16 @@ def iterate(
     header: bool | None = None,
     delimiter: str | None = None,
     decimal: str = ".",
-    definitions: Mapping[str, str] | None = None,
+    definitions: _Definitions = None,
 ) -> Iterator[Recording]:
     """The readings of a file block by block, as recordings of at most 4096 readings: for files beyond memory.
 
     Arguments and errors are those of `read`. Blocks come in the order of the file, and each has the report of its own
     readings; the clock is chosen from the first.
     """
-    request = Request(topic, field, clock, rate, labels, header, delimiter, decimal, definitions=definitions or {})
+    request = Request(
+        topic, field, clock, rate, labels, header, delimiter, decimal, definitions=definitions_of(definitions)
+    )
     address = fspath(path)
     with local(address) as place:
         with guarded(address):
@@ -121,14 +142,14 @@ def iterate(
             yield recording
 
 
-def describe(path: _Address, *, definitions: Mapping[str, str] | None = None) -> Contents:
+def describe(path: _Address, *, definitions: _Definitions = None) -> Contents:
     """What a file has: its topics and fields with their shapes and rates, and a line to copy.
 
     Of a bag the first 2000 messages are looked at. Raises RecordingError as `read` does.
     """
     address = fspath(path)
     with local(address) as place, guarded(address):
-        return _open(place, address, Request(definitions=definitions or {})).contents()
+        return _open(place, address, Request(definitions=definitions_of(definitions))).contents()
 
 
 def find(path: _Address) -> list[Path]:
@@ -257,8 +278,15 @@ def _recording(block: Block, source: Source, clock: str | None, columns: str | N
     readings, times, episodes, report = assemble(block, clock, source)
     report = replace(report, cut_off=source.cut_off, notes=tuple(source.notes))
     within = source.address, source.topic, source.field()
-    recording = Recording(*within, readings, times, episodes, report, block.annotations)
+    recording = Recording(*within, readings, times, episodes, report, block.annotations, _names(source, readings))
     return recording if columns is None else only_columns(recording, columns)
+
+
+def _names(source: Source, readings: npt.NDArray[Any]) -> tuple[str, ...]:
+    """The names of a table's columns, as its field lists them; none where there are none, or numbers for them."""
+    names = tuple(name.strip() for name in source.field().split(","))
+    own = not source.topics and readings.ndim == 2 and 1 < len(names) == len(set(names)) == readings.shape[1]
+    return names if own and not all(name.isdigit() for name in names) else ()
 
 
 def _clock(block: Block, requested: str | None) -> str | None:
@@ -325,9 +353,25 @@ def assemble(
         counters = {name: counts[order] for name, counts in counters.items()}
     episodes = _spans(clocks["log"], source.marks) if source.marks else _numbered(block.episodes, source)
     begins = [] if source.marks or source.continuous else [episode.begin for episode in episodes if episode.begin]
-    times = np.full(len(readings), np.nan) if clock is None else clocks[clock]
+    times = np.full(len(readings), np.nan) if clock is None else unwrapped(clocks[clock])
     unset = int(np.count_nonzero(clocks["header"] == 0)) if "header" in clocks else 0
-    return readings, times, episodes, _report(times, clock, counters, np.array(begins, np.int64), unset)
+    return readings, times, episodes, reported(times, clock, counters, np.array(begins, np.int64), unset)
+
+
+def unwrapped(times: _Times) -> _Times:
+    """Times of a counter of 16 or 32 bits, of s, ms, µs or ns, that goes on from 0 when it is full: as if it had more.
+
+    >>> unwrapped(np.array([65.534, 65.535, 0.0, 0.001])).round(3).tolist()
+    [65.534, 65.535, 65.536, 65.537]
+    """
+    steps = np.diff(times)
+    back = np.flatnonzero(steps < 0)
+    if len(back) and (steps > 0).any():
+        middle = float(np.median(steps[steps > 0]))
+        for period in (2.0**bits / unit for bits in (16, 32) for unit in (1, 1e3, 1e6, 1e9)):
+            if (abs(steps[back] + period - middle) <= _BATCH * middle).all() and times.max() < period:
+                return times + period * np.concatenate([[0], np.cumsum(steps < 0)])
+    return times
 
 
 def _numbered(numbers: npt.NDArray[np.int64] | None, source: Source) -> tuple[Episode, ...]:
@@ -350,36 +394,45 @@ def _spans(logged: npt.NDArray[np.float64], marks: list[tuple[float, str]]) -> t
     return tuple(Episode(begin, end, text) for begin, end, (_, text) in spans if text and end > begin)
 
 
-def _report(
-    times: npt.NDArray[np.float64],
+def reported(
+    times: _Times,
     clock: str | None,
-    counters: dict[str, npt.NDArray[np.int64]],
+    counters: Mapping[str, npt.NDArray[np.int64]],
     borders: npt.NDArray[np.int64],
     unset: int,
 ) -> Report:
+    """What times and counters say of readings. borders: the readings before which time begins anew."""
     inside = np.ones(max(len(times) - 1, 0), bool)
     inside[borders - 1] = False
     missing, repeated = _lost(counters, borders)
     report = Report(len(times), clock, lost=missing, unset=unset)
-    steps = np.diff(times)
-    if not (np.isfinite(steps) & inside).any():
-        return replace(report, repeated=repeated)
-    steps[~inside] = np.nan
+    steps = np.where(inside, np.diff(times), np.nan)
     forward = steps[steps > 0]
+    if not np.isfinite(steps).any():
+        return replace(report, repeated=repeated)
+    again = int(np.count_nonzero(steps == 0))
     middle = float(np.median(forward)) if len(forward) else 0.0
-    longest = longest_step(middle)
+    late = float(np.nanquantile(steps, _LATE))
+    batches = middle < _FAST and late > _BATCH * middle
+    longest = longest_step(late if batches else middle)
     regular = forward[forward <= min(longest, 2 * middle)]
+    counted = forward[(forward >= middle / 2) & (forward <= 1.5 * middle)]
+    if batches or again > len(forward):  # from the first batch, or the first new stamp, to the last
+        begins = np.flatnonzero((steps > (_BATCH * middle if batches else 0)) & (steps <= longest))
+        counted = steps[begins[0] + 1 : begins[-1] + 1] if len(begins) > 1 else steps
+        counted = counted[(counted >= 0) & (counted <= longest)]
+    seconds = float(counted.sum())
     return replace(
         report,
-        rate=1 / middle if middle > 0 else None,
+        rate=len(counted) / seconds if seconds > 0 else None,
         jitter=float(regular.std()) if len(regular) else None,
         gaps=tuple(Gap(int(i) + 1, float(steps[i])) for i in np.flatnonzero(steps > longest)),
-        repeated=repeated or int(np.count_nonzero(steps == 0)),
-        backward=int(np.count_nonzero(steps < 0)),
+        repeated=repeated or again,
+        back=tuple(Gap(int(i) + 1, -float(steps[i])) for i in np.flatnonzero(steps < 0)),
     )
 
 
-def _lost(counters: dict[str, npt.NDArray[np.int64]], borders: npt.NDArray[np.int64]) -> tuple[int | None, int]:
+def _lost(counters: Mapping[str, npt.NDArray[np.int64]], borders: npt.NDArray[np.int64]) -> tuple[int | None, int]:
     """Lost and repeated readings by the device's counter, or else by the recorder's, if it counts each topic alone."""
     single = {name: int(np.count_nonzero(np.diff(counts) == 1)) for name, counts in counters.items()}
     for name in ("message", "sequence"):

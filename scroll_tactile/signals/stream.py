@@ -42,6 +42,8 @@ class Stream:
     clipped: how many values lay outside the sensor's range before they were clipped to it.
     mask: which values were missing (NaN or infinite), bool of the readings' shape, read-only; None where none were.
         `readings` has in their place the line between their neighbours in time.
+    outside: how many readings of each channel lay outside the range, int64 of shape (n,); None of a camera, and where
+        nobody counted.
     raw: the stream as the sensor gave it, where a memory that was adapted to a changed skin has corrected it since
         (`TactileLearner.adapt`): it is not corrected again. None where nobody has.
 
@@ -53,6 +55,7 @@ class Stream:
     clipped: int = 0
     mask: npt.NDArray[np.bool_] | None = None
     raw: "Stream | None" = None
+    outside: npt.NDArray[np.int64] | None = None
 
     @property
     def missing(self) -> int:
@@ -202,16 +205,18 @@ def _sound(array: _Array, sensor: Sensor) -> Stream:
         _require_any(mask, sensor)
         values[mask] = low.min()  # neither clipped nor compared
         mask.setflags(write=False)
-    clipped = 0
+    clipped, beyond = 0, None
     if mask is not None or least < low.max() or most > high.min():
         outside = (values < low) | (values > high)
-        clipped = int(np.count_nonzero(outside if mask is None else outside & ~mask))
+        outside = outside if mask is None else outside & ~mask
+        clipped = int(np.count_nonzero(outside))
+        beyond = None if sensor.camera else np.count_nonzero(outside, axis=0)
         np.clip(values, low, high, out=values)
     if mask is not None:
         _interpolate(values, mask, sensor)
     values += np.float32(0)  # −0 becomes 0: equal readings must have equal keys
     values.setflags(write=False)
-    return Stream(sensor, values, clipped, mask)
+    return Stream(sensor, values, clipped, mask, outside=beyond)
 
 
 def _as_array(readings: Any, what: str, sensor: Sensor) -> _Array:

@@ -17,7 +17,7 @@ from faults.learners import KIT
 from faults.model import LISTED, State
 from scroll_tactile import Sensor, TactileLearner
 from scroll_tactile.embeddings.protocol import Capabilities
-from scroll_tactile.errors import RangeWarning
+from scroll_tactile.errors import FactWarning
 from scroll_tactile.prediction.features import FeatureExtractor
 
 CHECKPOINT_EVERY = 7
@@ -55,7 +55,7 @@ def prepare() -> None:
     """Have everything small, quick and in the hands of the schedule, and what a touch comes to worked out once."""
     gc.freeze()
     gc.set_threshold(20_000, 20, 100)
-    warnings.simplefilter("ignore", RangeWarning)
+    warnings.simplefilter("ignore", FactWarning)
     simulation_disk.prepare()
     KIT.touches, KIT.stream, KIT.materials = tuple(range(9)), stream, ("a", "b", "ü")
     KIT.noted = lambda touch: ({}, {"slip": f"{touch % 2}"} if touch % 3 == 0 else {})

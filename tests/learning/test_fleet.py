@@ -494,7 +494,8 @@ class TestRange:
             _, _, _, refused = by_one_process(tmp_path / "one", [beyond])
         with pytest.warns(RangeWarning, match="100 % of the values lie outside the range of sensor 'pad'") as met:
             done = run(tmp_path / "m", [beyond], workers=3)  # a share of each source
-        assert [str(each.message) for each in met] == [str(each.message) for each in first] == [done.range_problem]
+        assert [str(each.message) for each in met] == list(map(str, done.facts))
+        assert [str(each.message) for each in first] == [each.sentence for each in done.facts]
         assert met[0].filename == run.__code__.co_filename
         assert [(each.source, each.why) for each in done.refused] == refused
         assert (done.observations, done.repeated, len(done.refused)) == (1, 1, 4)
@@ -520,7 +521,9 @@ class TestRange:
             command(name, tmp_path / name, *words, *more) for name, more in (("learn", ()), ("fleet", ("--workers", 1)))
         ]
         for result in told:
-            assert result.stderr.startswith("Warning: 100 % of the values lie") and len(result.stderr.splitlines()) == 1
+            assert ": 100 % of the values lie" in result.stderr and len(result.stderr.splitlines()) == 1
+            (fact,) = json.loads(result.stdout)["facts"]
+            assert (fact["kind"], fact["size"], fact["source"]) == ("range", 1.0, str(beyond / "a" / "0.npy"))
         assert told[0].stderr == told[1].stderr
         refused = [json.loads(result.stdout)["refused"] for result in told]
         assert refused[0] == refused[1] and len(refused[0]) == 4

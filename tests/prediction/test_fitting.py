@@ -5,7 +5,7 @@ import pytest
 from live_touches import touched
 
 from scroll_tactile import Kernels, Quantity, Sensor, TactileLearner
-from scroll_tactile.clients.report.facts import _without
+from scroll_tactile.clients.report.memory_facts import _without
 from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.prediction.fitting import Draft, rehearse
 from scroll_tactile.prediction.judging import held_out_touches, judged

@@ -272,7 +272,7 @@ def test_a_library_that_is_not_installed_is_named_and_no_file_called_damaged(
         monkeypatch.delitem(sys.modules, module)
     for module in (lacks, "compression"):
         monkeypatch.setitem(sys.modules, module, None)
-    decoding._reader.cache_clear()
+    decoding._readers.cache_clear()
     for look in (lambda: read(path, field="data", topic="/skin" if extra == "ros" else None), lambda: describe(path)):
         with pytest.raises(MissingLibraryError, match=named) as raised:
             look()

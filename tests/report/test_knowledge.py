@@ -9,7 +9,7 @@ from scroll_tactile import Kernels, TactileLearner
 from scroll_tactile import sensors as known
 from scroll_tactile.clients.learning.metrics import calibration_error
 from scroll_tactile.clients.report.channels import channels_of
-from scroll_tactile.clients.report.facts import (
+from scroll_tactile.clients.report.memory_facts import (
     bins_of,
     chosen,
     growing,

@@ -342,6 +342,23 @@ def test_a_recording_shows_its_signal_and_gaps_and_proposes_touches(browser, tmp
     assert browser.evaluate("document.documentElement.scrollWidth") <= 390
 
 
+def test_a_recording_says_what_learning_would_say_of_it_and_how_to_guess_its_sensor(tmp_path):
+    readings = np.random.default_rng(0).uniform(0, 200, (200, 6))
+    readings[:, 2] = 7
+    times = np.arange(200) / 50 + 60.0 * (np.arange(200) >= 80)
+    table = np.column_stack([times, readings])
+    np.savetxt(tmp_path / "t.csv", table, delimiter=",", header="t,a,b,c,d,e,f", comments="")
+    text = words(recording_page(tmp_path / "t.csv"))
+    assert "1 gap in its times, the longest 60.02 s before reading 80" in text and "--rate keep takes it in one" in text
+    assert "channel 2 (c) never moves while all others do" in text
+    assert f"scroll-tactile sensor {tmp_path / 't.csv'} > sensor.json guesses" in text
+    assert "by its times it has 50 readings a second" in words(
+        recording_page(tmp_path / "t.csv", sensor=PAD.model_copy(update={"rate": 80.0}))
+    )
+    np.save(tmp_path / "touch.npy", readings[:, [0, 1, 3, 4, 5]])
+    assert "Nothing that learning would speak of." in words(recording_page(tmp_path / "touch.npy", rate=50.0))
+
+
 def test_channels_are_called_saturated_only_where_their_range_is_known(tmp_path):
     readings = np.clip(np.random.default_rng(0).normal(200, 80, (400, 6)), 0, 255)
     np.save(tmp_path / "touch.npy", readings)

@@ -54,6 +54,17 @@ def test_answers_are_those_of_a_live_session():
     json.dumps(answers, allow_nan=False)
 
 
+def test_a_topic_of_another_rate_and_odd_touches_are_spoken_of_once(own):
+    made, _, warnings = bridge(source=own, contact="manual")
+    run(made, np.tile(ROWS[:150], (2, 1)), rate=25.0)
+    assert len(warnings) == 1 and "it has 25 readings a second, and sensor 'pad' has 50" in warnings[0]
+    made.begin()
+    run(made, np.full((50, ROWS.shape[1]), 0.5), start=2000.0)
+    made.end()
+    made.learn("A")
+    assert any("A: nothing moves" in each for each in warnings) and any("beside 'a'" in each for each in warnings)
+
+
 def test_a_watched_sensor_is_noted_at_rest_and_in_known_touches_that_nobody_learns(tmp_path):
     with TactileLearner.open(tmp_path / "m", sensor=PAD, embedding=SMALL) as own:
         random = np.random.default_rng(1)

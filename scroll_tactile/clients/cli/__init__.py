@@ -63,7 +63,7 @@ def application() -> typer.Typer:
     """The commands, put together."""
     import typer
 
-    from scroll_tactile.clients.cli.bulk import demo, evaluate, fleet, learn, report
+    from scroll_tactile.clients.cli.bulk import demo, evaluate, fleet, learn, report, sensor
     from scroll_tactile.clients.cli.everyday import compose, describe, inspect, live, observe, predict
     from scroll_tactile.clients.cli.terminal import Commands, version
     from scroll_tactile.clients.cli.upkeep import PASSED_ON, mcp, memory, ros2
@@ -77,7 +77,8 @@ def application() -> typer.Typer:
         "it has never felt something. Start with: scroll-tactile demo",
     )
     app.callback()(version)
-    for command in (demo, observe, learn, fleet, predict, evaluate, live, inspect, describe, compose, report, mcp):
+    everyday = (demo, sensor, observe, learn, fleet, predict, evaluate, live, inspect, describe, compose, report, mcp)
+    for command in everyday:
         app.command()(command)
     app.command(context_settings=PASSED_ON)(ros2)
     app.add_typer(memory, name="memory")

@@ -1,4 +1,4 @@
-"""`scroll-tactile learn`, `fleet`, `evaluate`, `demo` and `report`: many touches, of files and of the simulation."""
+"""`scroll-tactile sensor`, `learn`, `fleet`, `evaluate`, `demo` and `report`: many touches, of files or simulated."""
 
 from __future__ import annotations
 
@@ -24,7 +24,9 @@ from scroll_tactile.clients.cli.terminal import (
     SensorName,
     Sources,
     confusion_text,
+    console,
     counted,
+    facts_as_json,
     no_memory,
     opened,
     opened_for_upkeep,
@@ -32,6 +34,7 @@ from scroll_tactile.clients.cli.terminal import (
     progress_bar,
     say,
     say_csv,
+    say_facts,
     say_json,
     say_refused,
     sensor_for,
@@ -47,11 +50,38 @@ if TYPE_CHECKING:
     from scroll_tactile.clients.learning.learning import Evaluation
     from scroll_tactile.clients.learning.sources import Refused
 
-__all__ = ["demo", "evaluate", "fleet", "learn", "report"]
+__all__ = ["demo", "evaluate", "fleet", "learn", "report", "sensor"]
 
 MOST_SHOWN = 20  # mistakes; JSON and CSV have all
 MOST_NAMES = 40  # of a table of confusions
 SECONDS = 20  # in which a scheduler answers
+MOST_GUESSED = 100  # recordings that a sensor is guessed from
+
+
+@with_options
+def sensor(sources: Sources, *, how: Reading) -> None:
+    """Guess a sensor from recordings of it, and print it as JSON: scroll-tactile sensor FILES > my.json.
+
+    How sure each field is comes on the standard error. The file is for --sensor of learn, fleet, observe and report.
+    """
+    from scroll_tactile.clients.learning.sources import Refused, find_sources
+    from scroll_tactile.recordings import read
+    from scroll_tactile.recordings.guessing import guessed_sensor
+
+    found, refused = find_sources(sources)
+    recordings = []
+    with progress_bar() as progress:
+        for number, source in enumerate(found[:MOST_GUESSED]):
+            progress(source, number, min(len(found), MOST_GUESSED))
+            try:
+                recordings.append(read(source, **vars(how)))
+            except InputError as error:
+                refused.append(Refused.by(error, source))
+    say_refused(refused)
+    guessed, said = guessed_sensor(recordings)
+    for line in said:
+        console(error=True).print(shown(line))
+    typer.echo(guessed.model_dump_json(indent=1, exclude_defaults=True))
 
 
 @with_options
@@ -117,6 +147,7 @@ def _learn(
     if as_json:
         learned = {"files": done.sources, "touches": done.observations, "learned": dict(sorted(done.learned.items()))}
         left = {"skipped": done.repeated, "refused": _refusals(done.refused), "deaths": done.deaths}
+        left |= {"facts": facts_as_json(done.facts)}
         say_json({**learned, **left, "observations": done.held, "seconds": done.seconds, "digest": done.digest})
     else:
         of = f" of {counted(len(done.learned), 'material')}" if done.learned else ""
@@ -163,7 +194,7 @@ def evaluate(
         done = evaluate_sources(learner, found, options, progress, of=of, with_learned=with_learned)
     refused = [*missing, *done.refused]
     if as_json:
-        say_json(_figures(done) | {"refused": _refusals(refused)})
+        say_json(_figures(done) | {"refused": _refusals(refused), "facts": facts_as_json(done.facts)})
     elif as_csv:
         say_csv(*ANSWER, of or "material", "right")
         for each in done.answered:
@@ -171,6 +202,7 @@ def evaluate(
     else:
         _report_evaluated(done, with_learned)
     if not as_json:
+        say_facts(done.facts)
         say_refused(refused)
     if refused:
         raise typer.Exit(1)

@@ -20,6 +20,7 @@ from scroll_tactile.clients.cli.terminal import (
     AsCsv,
     AsJson,
     Axis,
+    ByTimes,
     Columns,
     MemoryFolder,
     Reading,
@@ -27,15 +28,18 @@ from scroll_tactile.clients.cli.terminal import (
     Scene,
     Sources,
     StreamFile,
+    Timed,
     console,
     counted,
     estimate_text,
+    facts_as_json,
     materials_of,
     opened,
     opened_for_upkeep,
     percent,
     say,
     say_csv,
+    say_facts,
     say_json,
     say_refused,
     sensor_for,
@@ -43,15 +47,16 @@ from scroll_tactile.clients.cli.terminal import (
     verdict,
     with_options,
 )
-from scroll_tactile.errors import DescriptionError, InputError, printable
-from scroll_tactile.settings import LONGEST_SOURCE, require_name
+from scroll_tactile.errors import DescriptionError, InputError
+from scroll_tactile.settings import require_name
 
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
     from scroll_tactile.clients.learning.learning import Answered
-    from scroll_tactile.clients.learning.sources import Refused
+    from scroll_tactile.clients.learning.sources import Refused, SourceOptions, SourceTouch
+    from scroll_tactile.learner import TactileLearner
     from scroll_tactile.live.answers import LiveReport, LiveState, LiveTouch
     from scroll_tactile.live.session import LiveSession
     from scroll_tactile.results import Estimate
@@ -82,7 +87,7 @@ def observe(
             "name, channels, rate, low, high, unit and duration; or give --preset. Needed only to make a new memory."
         ),
     ] = None,
-    how: Reading,
+    how: Timed,
     value: Annotated[
         list[str] | None,
         Option(help="What was measured of it, such as force=1.4, of a declared quantity; several times."),
@@ -92,8 +97,9 @@ def observe(
     ] = None,
 ) -> None:
     """Learn how a material feels, from one touch in a file; it is on disk when this returns."""
+    from scroll_tactile.clients.learning.sources import stored_source
     from scroll_tactile.learner import TactileLearner
-    from scroll_tactile.recordings import read
+    from scroll_tactile.signals.facts import OF_TOUCHES
 
     require_name(material)
     labels = _noted("axis", axis)
@@ -101,24 +107,37 @@ def observe(
         values = {name: float(number) for name, number in _noted("value", value).items()}
     except ValueError as error:
         raise InputError(f"expected --value as a name and a number, such as force=1.4: {error}") from None
-    recording = read(file, **vars(how))
-    chosen = sensor_for(memory, sensor, how.preset)
+    options, chosen = how.taken(cut="none", material=material), sensor_for(memory, sensor, how.preset)
     if chosen is not None and not memory.exists():
-        TactileLearner(sensor=chosen).stream(recording.stream(chosen))  # what is refused makes no memory
+        options = options.by_names([str(file)], chosen)
+        chosen = chosen.model_copy(update={"columns": tuple(options.names) or None})
+        _one_touch(TactileLearner(sensor=chosen), str(file), options)  # what is refused makes no memory
     with opened(memory, sensor=chosen, new=True) as learner:
-        source = printable(str(file))[-LONGEST_SOURCE:]
-        stream = learner.stream(recording.stream(learner.sensor))
-        others = [name for name in learner.names_of(stream) if name != material]
-        receipt = learner.observe(material, stream, values=values, labels=labels, source=source)
+        touch = _one_touch(learner, str(file), options.by_names([], learner.sensor))
+        say_facts([fact for fact in touch.facts if fact.kind not in OF_TOUCHES])  # of the others observe warns
+        source = stored_source(str(file))
+        receipt = learner.observe(material, touch.stream, values=values, labels=labels, source=source)
         count = learner.materials[material]
     clipped = f", {receipt.clipped} values outside the sensor's range clipped" if receipt.clipped else ""
     done = f"{receipt.seconds:g} s kept as observation {receipt.sequence}{clipped}"
     if receipt.repeated:
         done = f"this touch was learned already, as observation {receipt.sequence}"
     say(f"{shown(material)}: {done}")
-    if others:
-        say(f"this very touch is there as {', '.join(map(shown, others))}, too: relabel or retract one of them")
     say(f"it has now been observed {counted(count, 'time')}")
+
+
+def _one_touch(learner: TactileLearner, file: str, options: SourceOptions) -> SourceTouch:
+    """The one touch in a file. Raises InputError where it is refused, or is several."""
+    from scroll_tactile.clients.learning.sources import Refused, source_touches
+
+    found = list(source_touches(learner, file, options, named=False))
+    if isinstance(found[0], Refused):
+        raise found[0].error()
+    if len(found) > 1:
+        why = next(str(fact) for fact in found[0].facts if fact.then == "cut")
+        text = f"expected one touch; these are {len(found)}, for `scroll-tactile learn`. {why}"
+        raise InputError(text, argument="rate")
+    return found[0]
 
 
 def _noted(option: str, given: Sequence[str] | None) -> dict[str, str]:
@@ -138,7 +157,7 @@ def predict(
     *,
     scene: Scene = None,
     of: Axis = None,
-    how: Reading,
+    how: Timed,
     as_json: Annotated[
         bool, Option("--json", help="Print JSON, with the whole ranking; of many touches a line each.")
     ] = False,
@@ -149,9 +168,9 @@ def predict(
     Of many the exit code is 1 where some were refused.
     """
     from scroll_tactile.clients.learning.learning import answers
-    from scroll_tactile.clients.learning.sources import SourceOptions, find_sources
+    from scroll_tactile.clients.learning.sources import find_sources
 
-    options = SourceOptions(**vars(how))
+    options = how.taken()
     found, refused = find_sources(sources)
     alone = len(sources) == 1 and len(found) + len(refused) == 1 and not as_csv
     with opened(memory, mode="read") as learner:
@@ -169,22 +188,27 @@ def predict(
 
 
 def _show_answers(answered: Iterator[Answered | Refused], as_json: bool, as_csv: bool) -> list[Refused]:
-    """Print a line for each answer, as it comes; returns what was refused."""
+    """Print a line for each answer, as it comes, and what is odd at the end; returns what was refused."""
     from scroll_tactile.clients.learning.sources import Refused
+    from scroll_tactile.signals.facts import Fact, merged
 
-    refused = []
+    refused, facts = [], list[Fact]()
     if as_csv:
         say_csv(*ANSWER)
     for each in answered:
         if isinstance(each, Refused):
             refused.append(each)
-        elif as_csv:
+            continue
+        facts = merged([*facts, *each.touch.facts])
+        if as_csv:
             say_csv(*answer_row(each))
         elif as_json:
             say_json({"source": each.touch.source} | _answer(each))
         else:
             say(f"{shown(each.touch.source)}: {verdict(each.prediction)}")
             _say_estimates(each.estimates)
+    if not as_json:
+        say_facts(facts)
     return refused
 
 
@@ -193,10 +217,11 @@ def _show_answer(found: Answered | Refused, as_json: bool) -> None:
     from scroll_tactile.clients.learning.sources import Refused
 
     if isinstance(found, Refused):
-        raise InputError(found.why, argument=found.argument)
+        raise found.error()
     if as_json:
         say_json(_answer(found))
         return
+    say_facts(found.touch.facts)
     ranked = [f"  {percent(probability):>8}  {shown(name)}" for name, probability in found.prediction.ranking[:SHOWN]]
     say(f"{verdict(found.prediction)}, from {found.prediction.seconds:g} s of touch", *ranked)
     _say_estimates(found.estimates)
@@ -209,8 +234,8 @@ def _say_estimates(estimates: Mapping[str, Estimate], margin: str = "  ") -> Non
 
 def _answer(answered: Answered) -> dict[str, Any]:
     of = answered.prediction
-    ranked = {"seconds": of.seconds, "ranking": of.ranking_as_json()}
-    return of.as_json() | ranked | _measured(answered.estimates)
+    more = {"seconds": of.seconds, "ranking": of.ranking_as_json(), "facts": facts_as_json(answered.touch.facts)}
+    return of.as_json() | more | _measured(answered.estimates)
 
 
 def _measured(estimates: Mapping[str, Estimate]) -> dict[str, Any]:
@@ -298,13 +323,16 @@ def _constituent(text: str) -> tuple[str, float | bool | tuple[float, str] | Non
     return name.strip(), (share, unit.strip()) if unit else share
 
 
-def compose(memory: MemoryFolder, file: StreamFile, columns: Columns = None, as_json: AsJson = False) -> None:
+def compose(
+    memory: MemoryFolder, file: StreamFile, columns: Columns = None, rate: ByTimes = None, as_json: AsJson = False
+) -> None:
     """Say what a touch in a file feels made of, of all that was described; the memory stays as it is."""
     from scroll_tactile.recordings import read
 
     recording = read(file, columns=columns)
     with opened(memory, mode="read") as learner:
-        made_of = learner.compose(recording.stream(learner.sensor))
+        by: Any = None if rate is None else rate.value
+        made_of = learner.compose(recording.stream(learner.sensor, rate=by))
     if as_json:
         kept = ("presence", "share", "evidence", "unlearned")
         found = [{"constituent": of.name, **{name: getattr(of, name) for name in kept}} for of in made_of.constituents]

@@ -27,7 +27,7 @@ from typer.core import TyperGroup
 
 from scroll_tactile import __version__, native
 from scroll_tactile.clients.cli import INTERRUPTED
-from scroll_tactile.errors import InputError, RangeWarning, ScrollTactileError, plain_cell, printable
+from scroll_tactile.errors import FactWarning, InputError, ScrollTactileError, plain_cell, printable
 from scroll_tactile.results import Estimate, Prediction
 from scroll_tactile.settings import GONE
 
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from scroll_tactile.clients.learning.sources import Refused, SourceOptions
     from scroll_tactile.learner import TactileLearner
     from scroll_tactile.sensors import Sensor
+    from scroll_tactile.signals.facts import Fact
 
 MOST_REFUSED = 20
 
@@ -43,6 +44,7 @@ Mode = Literal["write", "read"]
 _options: ContextVar[dict[str, str]] = ContextVar("_options")  # of the command that was typed, by their names in Python
 
 
+Rate = StrEnum("Rate", ["keep", "resample"])
 Cut = StrEnum("Cut", ["episodes", "intervals", "none", "contact"])
 
 MemoryFolder = Annotated[Path, Argument(help="The folder of the memory.", show_default=False)]
@@ -61,6 +63,13 @@ SensorName = Annotated[
     str | None, Option(help="Whose readings they are, as for observe; or give --preset. For a new memory.")
 ]
 Columns = Annotated[str | None, Option(help="Of wider arrays and tables, by places from 0: 25:44, or 0,3,5:9.")]
+ByTimes = Annotated[
+    Rate | None,
+    Option(
+        help="Of recordings that have another rate than the sensor by their times: keep takes the numbers as they are, "
+        "resample a reading each step of the sensor's. Without it they are refused from a fifth on."
+    ),
+]
 Axis = Annotated[str | None, Option(help="An axis of labels, such as slip, to answer by in place of materials.")]
 Scene = Annotated[
     str | None, Option(help="The materials that can be here, separated by commas; all of them otherwise.")
@@ -85,10 +94,28 @@ class Reading:
     field: Annotated[str | None, Option(help="The path to the numbers, such as 'tactiles[0].electrodes'.")] = None
     clock: Annotated[str | None, Option(help="device, header, publish or log; or a field, column or array.")] = None
     columns: Columns = None
+    definitions: Annotated[
+        Path | None, Option(help="A folder of .msg files, for a bag that does not define its messages.")
+    ] = None
 
 
 @dataclass(frozen=True)
-class Named(Reading):
+class Timed(Reading):
+    """The same, as touches of a sensor with a rate of its own."""
+
+    rate: ByTimes = None
+
+    def taken(self, **more: Any) -> SourceOptions:
+        """How these recordings are read. Raises InputError for options that do not fit together."""
+        from scroll_tactile.clients.learning.sources import SourceOptions
+        from scroll_tactile.recordings.decoding import definitions_of
+
+        given = {name: getattr(value, "value", value) for name, value in vars(self).items() if value is not None}
+        return SourceOptions(**{**given, "definitions": definitions_of(self.definitions), **more})
+
+
+@dataclass(frozen=True)
+class Named(Timed):
     """How recordings are read, cut into touches and named: the fields of `SourceOptions`, as they are typed."""
 
     material: Annotated[str | None, Option("--label", help="What all of them are touches of.")] = None
@@ -118,11 +145,9 @@ class Named(Reading):
 
     def options(self) -> SourceOptions:
         """How recordings are read, cut and named. Raises InputError for options that do not fit together."""
-        from scroll_tactile.clients.learning.sources import SourceOptions
         from scroll_tactile.recordings import declared_quantities, read_intervals
 
-        given = {name: getattr(value, "value", value) for name, value in vars(self).items() if value is not None}
-        given["annotate"] = tuple(given.get("annotate", ()))
+        given: dict[str, Any] = {"annotate": tuple(getattr(self, "annotate", None) or ())}
         if self.intervals is not None:
             if self.labels is not None:
                 raise InputError("give --labels or --label-topic: both say where touches begin")
@@ -130,7 +155,7 @@ class Named(Reading):
             given["quantities"] = tuple(declared_quantities(self.intervals))
             if not given["intervals"]:
                 raise InputError(f"expected touches in {self.intervals}, one row each; there are none")
-        return SourceOptions(**given)
+        return self.taken(**given)
 
 
 @dataclass(frozen=True)
@@ -219,6 +244,17 @@ def say_refused(refused: Sequence[Refused]) -> None:
         listed = listed or bool(others)
     if len(refused) > MOST_REFUSED:
         _warn(f"[yellow]refused:[/] {len(refused) - MOST_REFUSED} more")
+
+
+def say_facts(facts: Sequence[Fact | FactWarning]) -> None:
+    """Print on the standard error what is odd about what was read."""
+    for fact in facts:
+        _warn(f"[yellow]Warning:[/] {shown(in_options(str(fact), fact.argument))}")
+
+
+def facts_as_json(facts: Sequence[Fact]) -> list[dict[str, Any]]:
+    """What is odd about what was read, in JSON's types."""
+    return [fact.to_json() | {"text": in_options(fact.sentence, fact.argument)} for fact in facts]
 
 
 def shown(text: object) -> str:
@@ -311,12 +347,12 @@ def in_options(text: str, argument: str | None) -> str:
 def _warnings_as_lines() -> Iterator[None]:
     """Show the warnings of this library as lines, and not where they came from."""
     with warnings.catch_warnings():
-        warnings.simplefilter("always", RangeWarning)
+        warnings.simplefilter("always", FactWarning)
         others = warnings.showwarning
 
         def show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
-            if issubclass(category, RangeWarning):
-                _warn(f"[yellow]Warning:[/] {shown(message)}")
+            if isinstance(message, FactWarning):
+                say_facts([message])
             else:
                 others(message, category, *where, **more)
 
@@ -346,7 +382,10 @@ def opened(path: Path, *, sensor: Sensor | None = None, mode: Mode = "write", ne
 
 def no_memory(path: Path, *, new: bool = False) -> InputError:
     """The error of a command whose memory is not there, with how this or another command makes one."""
-    how = "to make one, say which sensor it is for: --sensor or --preset"
+    how = (
+        "to make one, say which sensor it is for: --sensor or --preset. Of one that is not known "
+        "`scroll-tactile sensor FILES > sensor.json` guesses it from its recordings, for --sensor sensor.json"
+    )
     return InputError(f"there is no memory in {path}; {how if new else 'scroll-tactile observe or learn makes one'}")
 
 

@@ -38,7 +38,7 @@ from scroll_tactile_store.files import new_file, remove_tree
 from scroll_tactile.clients.learning.learning import Learned, Progress, learn_sources
 from scroll_tactile.clients.learning.sources import Refused, SourceOptions, find_sources, is_memory, stored_source
 from scroll_tactile.embeddings.protocol import Embedding
-from scroll_tactile.errors import CapacityError, InputError, MismatchError, RangeWarning, ScrollTactileError
+from scroll_tactile.errors import CapacityError, FactWarning, InputError, MismatchError, ScrollTactileError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.memory.identity import Identity
 from scroll_tactile.persistence.merge import Choice
@@ -46,6 +46,7 @@ from scroll_tactile.quantities import Quantity, require_declarable
 from scroll_tactile.recipe import Recipe, RecipeRequest
 from scroll_tactile.recordings.locations import local
 from scroll_tactile.sensors import Sensor
+from scroll_tactile.signals.facts import Fact, merged, name_fact, warn_of
 
 __all__ = ["FleetReport", "Processes", "learn"]
 
@@ -61,8 +62,8 @@ class FleetReport:
     their sum. repeated: touches that had come before, by their names and contents. refused: what was not learned, and
     why; of touches that came under two names the first counts, of the memory and then of the sources in their order.
     deaths: shares whose worker ended before them. seconds: by the clock. held, digest: of the memory that came out;
-    0 and "" where nothing was learned, and no memory was made. range_problem: where touches do not fit the sensor's
-    range, what is wrong with the first, and what to do.
+    0 and "" where nothing was learned, and no memory was made. facts: what is odd about what was learned, each kind
+    once, with its first source and how many have it.
     """
 
     sources: int = 0
@@ -73,7 +74,7 @@ class FleetReport:
     seconds: float = 0.0
     held: int = 0
     digest: str = ""
-    range_problem: str | None = None
+    facts: list[Fact] = field(default_factory=list)
 
     @property
     def observations(self) -> int:
@@ -111,7 +112,9 @@ def learn(
     What is merged is durable. Call again after an interruption, and it goes on: what a worker had completed is not
     learned again. A worker that dies is tried once more, source by source. Sources that cannot be read, and those whose
     worker died twice, are listed in the report; all others are learned.
-    Warns at the end, by a RangeWarning, where touches do not fit the sensor's range; they are learned all the same.
+    Warns at the end by a FactWarning of each kind of fact, see `FleetReport`; the touches are learned all the same.
+    Tables with names of columns are read by these, as the sensor has them or the first source, and a new memory's
+    sensor keeps them.
 
     Raises InputError without a sensor for a new memory, and for several workers where the memory was adapted to a
     changed skin; MismatchError for a memory of another sensor; AnnotationError where it has a quantity with another
@@ -129,22 +132,29 @@ def learn(
     found, missing = find_sources(paths)
     options = (options or SourceOptions()).among(found, paths)
     report = FleetReport(sources=len(found), refused=missing)
+    if sensor is not None and not place.exists():
+        options = options.by_names(found, sensor)
+        sensor = sensor.model_copy(update={"columns": tuple(options.names) or None})
     asked = RecipeRequest.of(sensor, embedding, {"exemplars": exemplars, "kept_touches": kept_touches})
     with _opened(place, asked) as learner:
-        run = _Run(learner, options, descriptions, report, progress)
+        run = _Run(learner, options.by_names(found, learner.sensor), descriptions, report, progress)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RangeWarning)  # it is said at the end
+            warnings.simplefilter("ignore", FactWarning)  # they are said at the end
             if executor is None and workers == 1:
                 run.learn_here(found)
             else:
                 run.learn_apart(found, workers or os.cpu_count() or 1, executor)
+        names = list(learner.materials)
+        for name in sorted(report.learned.keys() - run.before.keys()):
+            names.remove(name)  # it stands beside those before, and those that are still to be looked at
+            report.facts = merged([*report.facts, *name_fact(name, names)])
         if report.held:
             report.digest = learner.digest()
             with suppress(ScrollTactileError):  # the touches are learned: who opens the memory is told
                 learner.settle()
     report.seconds = time.perf_counter() - begun
-    if report.range_problem is not None:
-        warnings.warn(report.range_problem, RangeWarning, stacklevel=2)
+    for fact in report.facts:
+        warn_of(fact)
     return report
 
 
@@ -204,7 +214,7 @@ def learn_share(share: Share) -> None:
     with reported(share.folder, "making the folder of a share"):
         made = TemporaryDirectory(dir=share.folder.parent, prefix=f"{share.folder.name}.", suffix=".partial")
     with made as draft, warnings.catch_warnings():
-        warnings.simplefilter("ignore", RangeWarning)
+        warnings.simplefilter("ignore", FactWarning)
         whole = Path(draft) / "whole"
         known = {bytes.fromhex(key): names for key, names in json.loads(share.known.read_text("utf-8")).items()}
         with TactileLearner.open(whole / share.memory.name, **share.recipe.arguments) as learner, learner.batch():
@@ -237,7 +247,7 @@ class _Run:
             require_declarable(learner.quantities, quantity)
         self._learner, self._options, self._descriptions = learner, options, descriptions
         self._report, self._progress, self._begun = report, progress, time.perf_counter()
-        self._before, self._done = Counter(learner.materials), 0
+        self.before, self._done = Counter(learner.materials), 0
 
     def learn_here(self, found: Sequence[str]) -> None:
         """Have this process learn all sources, into the memory itself."""
@@ -365,11 +375,11 @@ class _Run:
     def _note(self, done: Learned) -> None:
         self._report.refused += done.refused
         self._report.repeated += done.skipped
-        self._report.range_problem = self._report.range_problem or done.range_problem
+        self._report.facts = merged([*self._report.facts, *done.facts])
 
     def _came_in(self, sources: int) -> None:
         report, learner = self._report, self._learner
-        report.learned, report.held = Counter(learner.materials) - self._before, sum(learner.materials.values())
+        report.learned, report.held = Counter(learner.materials) - self.before, sum(learner.materials.values())
         self._done += sources
         rate = report.observations / (time.perf_counter() - self._begun)
         self._show(f"{report.observations} touches, {rate:.0f} a second, {len(report.refused)} refused")

@@ -17,7 +17,7 @@ from scroll_tactile.errors import EmbeddingError, InputError, printable
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.persistence.observations import refusal
 from scroll_tactile.results import Estimate, Prediction
-from scroll_tactile.signals.ranges import all_clipped, range_problem
+from scroll_tactile.signals.facts import Fact, all_clipped, merged
 
 __all__ = ["Answered", "Evaluation", "Learned", "Progress", "answers", "evaluate_sources", "learn_sources"]
 
@@ -35,7 +35,7 @@ class Learned:
     files: how many were read. learned: material → touches. skipped: touches that the memory had already under this
     name, by the hash of their content. refused: what was not learned. known: contents that were skipped or refused
     because another memory has them, see `learn_sources`. clipped: contents of touches all of whose values lay outside
-    the sensor's range. range_problem: of the first touch that does not fit it.
+    the sensor's range. facts: what is odd about what was learned, each kind once.
     """
 
     files: int = 0
@@ -44,19 +44,20 @@ class Learned:
     refused: list[Refused] = field(default_factory=list)
     known: set[bytes] = field(default_factory=set)
     clipped: set[bytes] = field(default_factory=set)
-    range_problem: str | None = None
+    facts: list[Fact] = field(default_factory=list)
 
     def to_json(self) -> dict[str, Any]:
         """It in JSON's types."""
         contents = {name: sorted(key.hex() for key in getattr(self, name)) for name in ("known", "clipped")}
-        return {**vars(self), "refused": [vars(each) for each in self.refused], **contents}
+        lists = {name: [vars(each) for each in getattr(self, name)] for name in ("refused", "facts")}
+        return {**vars(self), **lists, **contents}
 
     @classmethod
     def from_json(cls, told: Mapping[str, Any]) -> Self:
         """What `to_json` gave. Raises TypeError, LookupError or ValueError for anything else."""
         contents = {name: {bytes.fromhex(key) for key in told[name]} for name in ("known", "clipped")}
-        refused = [Refused(**each) for each in told["refused"]]
-        return cls(**{**told, "learned": Counter(told["learned"]), "refused": refused, **contents})
+        lists = {name: [kind(**each) for each in told[name]] for name, kind in (("refused", Refused), ("facts", Fact))}
+        return cls(**{**told, "learned": Counter(told["learned"]), **lists, **contents})
 
 
 def learn_sources(
@@ -79,6 +80,7 @@ def learn_sources(
     StoreError and CapacityError; what was learned until then is kept.
     """
     done, batch, size, since = Learned(), list[tuple[int, SourceTouch]](), 0, 0.0
+    options = options.by_names(sources, learner.sensor)
     for quantity in options.declared:
         learner.declare(quantity)
 
@@ -131,12 +133,13 @@ def _observe(
         raise
     if why is not None:
         done.refused.append(Refused(touch.source, why))
-    elif repeated:
+        return
+    done.facts = merged([*done.facts, *touch.facts])
+    if repeated:
         done.skipped += 1
     else:
         done.learned[material] += 1
         done.clipped |= {key} if clipped else set()
-        done.range_problem = done.range_problem or range_problem(touch.stream)
 
 
 @dataclass(frozen=True)
@@ -176,6 +179,7 @@ def _answered(
 def _touches(
     learner: TactileLearner, sources: Sequence[str], options: SourceOptions, progress: Progress, *, named: bool
 ) -> Iterator[SourceTouch | Refused]:
+    options = options.by_names(sources, learner.sensor) if len(sources) > 1 or learner.sensor.columns else options
     for number, address in enumerate(sources):
         progress(printable(Path(address).name), number, len(sources))
         yield from source_touches(learner, address, options, named=named)
@@ -187,7 +191,8 @@ class Evaluation:
 
     answered: in the order of the sources. refused: what was not answered. learned: the materials of the memory, or its
     labels. seen: touches that the memory had learned, under any name; left out, or answered with `with_learned`.
-    of: the axis; None for materials. unlabelled: touches without a label on it, which are left out.
+    of: the axis; None for materials. unlabelled: touches without a label on it, which are left out. facts: what is odd
+    about the touches, each kind once.
     """
 
     answered: tuple[Answered, ...]
@@ -196,6 +201,7 @@ class Evaluation:
     seen: int = 0
     of: str | None = None
     unlabelled: int = 0
+    facts: tuple[Fact, ...] = ()
 
     def truth(self, answered: Answered) -> str:
         """The name of a touch."""
@@ -284,11 +290,13 @@ def evaluate_sources(
     learner.settle()
     answered: list[Answered] = []
     refused: list[Refused] = []
-    seen = unlabelled = 0
+    seen, unlabelled, facts = 0, 0, list[Fact]()
     for touch in _touches(learner, sources, options, progress, named=of is None):
         if isinstance(touch, Refused):
             refused.append(touch)
-        elif _name_of(touch, of) is None:
+            continue
+        facts = merged([*facts, *touch.facts])
+        if _name_of(touch, of) is None:
             unlabelled += 1
         else:
             known = bool(learner.names_of(touch.stream))
@@ -297,7 +305,13 @@ def evaluate_sources(
                 answered.append(_answered(learner, touch, of=of))
     learned = frozenset(learner.materials if of is None else learner.axes[of])
     return Evaluation(
-        answered=tuple(answered), refused=tuple(refused), learned=learned, seen=seen, of=of, unlabelled=unlabelled
+        answered=tuple(answered),
+        refused=tuple(refused),
+        learned=learned,
+        seen=seen,
+        of=of,
+        unlabelled=unlabelled,
+        facts=tuple(facts),
     )
 
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal, Self
 
@@ -18,13 +20,16 @@ from scroll_tactile.errors import AnnotationError, InputError, RecordingError, S
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.live.detector import contact_spans
 from scroll_tactile.quantities import Quantity
-from scroll_tactile.recordings import Interval, Recording, Touch, find, presets, read, touches
+from scroll_tactile.recordings import Interval, Recording, Touch, find, iterate, presets, read, resampled, touches
 from scroll_tactile.recordings.headings import Heading, Noted, noted_in
 from scroll_tactile.recordings.locations import file_system, is_remote
-from scroll_tactile.recordings.recording import require_columns
+from scroll_tactile.recordings.recording import in_order, require_columns
 from scroll_tactile.recordings.touches import require_found
+from scroll_tactile.sensors import Sensor
 from scroll_tactile.settings import LONGEST_SOURCE, require_name
+from scroll_tactile.signals.facts import Fact
 from scroll_tactile.signals.stream import Stream
+from scroll_tactile.signals.windows import SHORTEST
 
 __all__ = [
     "Cut",
@@ -39,6 +44,7 @@ __all__ = [
 
 RECORDINGS = (".bag", ".db3", ".mcap", ".npy", ".npz", ".mat", ".csv", ".h5", ".hdf5", ".parquet", ".feather")
 PACKED = (".part",)  # what is looked for in a remote folder: the names that packed memories have
+_LOOKED = 3  # sources are looked at for the names of columns
 WHOLE = ("metadata.yaml", "meta/info.json", ".zgroup", "zarr.json")  # in a folder that is one recording
 
 Cut = Literal["episodes", "intervals", "none", "contact"]
@@ -51,12 +57,16 @@ _BY = ("topic", "file", "folder", "task")
 class SourceOptions:
     """How sources are read, cut into touches, and named.
 
-    topic, field, clock, columns, preset, labels, annotate: as of `recordings.read`. cut: None cuts by the intervals
-    where there are some, by episodes where a recording has some, and not otherwise.
+    topic, field, clock, columns, definitions, preset, labels, annotate: as of `recordings.read`. cut: None cuts by the
+    intervals where there are some, by episodes where a recording has some, and not otherwise.
     material: the name of all touches. by: what names each touch, as of `recordings.touches`, or "folder:2", the second
     folder below one of `tops`, see `among`. intervals: the table's. At most one of the three names them; without any,
     episodes name themselves. quantities: that are declared before anything is learned, as the table's headings do
     (`recordings.declared_quantities`), beside those of `annotate`.
+    rate: what becomes of a recording that has another rate than the sensor by its times: "keep" takes its numbers as
+    they are, whatever its times say, "resample" a reading each step of the sensor's; unless given it is refused where
+    they differ by a fifth or more.
+    names: the channels' columns, by which tables with names are read, and names_of who has them; see `by_names`.
 
     The value of a touch in a column that annotates it is the mean of the touch's readings that have a number there, its
     label the one text that they have: a touch with two is refused.
@@ -68,6 +78,7 @@ class SourceOptions:
     field: str | None = None
     clock: str | None = None
     columns: str | None = None
+    definitions: Mapping[str, str] | Path | None = None
     preset: str | None = None
     labels: str | None = None
     annotate: Sequence[str] = ()
@@ -76,6 +87,9 @@ class SourceOptions:
     by: str | None = None
     intervals: Sequence[Interval] | None = None
     quantities: Sequence[Quantity] = ()
+    rate: Literal["keep", "resample"] | None = None
+    names: Sequence[str] = ()
+    names_of: str = ""
     tops: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -93,6 +107,8 @@ class SourceOptions:
             presets.find(self.preset)
         if self.columns is not None:
             require_columns(self.columns)
+        if self.rate not in (None, "keep", "resample"):
+            raise InputError(f"expected rate='keep' or 'resample'; came {self.rate!r:.60}", argument="rate")
         if self.cut == "intervals" and self.intervals is None:
             raise InputError(
                 "cut='intervals' takes intervals=, a table with columns file, begin, end and material",
@@ -152,31 +168,87 @@ class SourceOptions:
         of_columns = (Heading.parsed(text).quantity for text in self.annotate)
         return [*self.quantities, *filter(None, of_columns)]
 
-    def touches_in(self, address: str, learner: TactileLearner) -> tuple[Recording, tuple[Touch, ...]]:
-        """A source and the touches in it; raises what `recordings.read` and `recordings.touches` raise."""
+    def by_names(self, sources: Sequence[str], sensor: Sensor) -> SourceOptions:
+        """The options with the names of the sensor's columns, or else of those of the first source that can be read."""
+        if self.columns is not None or self.names_of or sensor.camera:
+            return self
+        if sensor.columns:
+            return replace(self, names=sensor.columns, names_of=f"sensor {sensor.name!r}")
+        where = {name: getattr(self, name) for name in ("topic", "field", "clock", "preset", "labels")}
+        for address in [source for source in sources if not is_memory(source)][:_LOOKED]:
+            with suppress(InputError, OSError):
+                names = next(iterate(address, **where)).names
+                return replace(self, names=names if len(names) == sensor.channels else (), names_of=address)
+        return self
+
+    def recording(self, address: str, sensor: Sensor) -> tuple[Recording, list[Fact]]:
+        """A source as the sensor's recording, and what is odd about it.
+
+        Raises what `recordings.read` raises, and RecordingError for another rate and for other columns.
+        """
         recording = read(
             address,
             topic=self.topic,
             field=self.field,
             clock=self.clock,
             columns=self.columns,
+            definitions=self.definitions,
             preset=self.preset,
-            rate=learner.sensor.rate,  # where it has no clock
+            rate=sensor.rate,  # where it has no clock
             labels=self.labels,
             annotate=self.annotate,
         )
+        recording, facts = in_order(recording, self.names, self.names_of)
+        for fact in recording.facts(sensor):
+            if (fact.kind == "rate" and self.rate is not None) or (fact.argument == "rate" and self.rate == "keep"):
+                continue
+            if fact.then == "refused":
+                raise fact.error()
+            facts.append(fact)
+        if self.rate == "resample" and recording.report.clock not in (None, "rate"):
+            recording = resampled(recording, sensor.rate, recording.breaks(sensor))
+        return recording, facts
+
+    def touches_in(self, recording: Recording, learner: TactileLearner) -> tuple[Touch | Refused, ...]:
+        """The touches in a recording, each in one piece by its times, and those whose pieces are too short.
+
+        Raises what `recordings.touches` raises.
+        """
         if self.intervals is not None:
-            return recording, touches(recording, self.intervals)
-        whole = self.cut == "none" or (self.cut is None and not recording.episodes)
-        cut: Any = partial(_contacts, learner) if self.cut == "contact" else "whole" if whole else "episodes"
-        if (level := _FOLDER.fullmatch(self.by or "")) is None:
-            return recording, touches(recording, cut, self.by)
-        folders = self.folders(address)
-        if not 0 < int(level[1]) <= len(folders):
+            found = touches(recording, self.intervals)
+        else:
+            whole = self.cut == "none" or (self.cut is None and not recording.episodes)
+            cut: Any = partial(_contacts, learner) if self.cut == "contact" else "whole" if whole else "episodes"
+            found = touches(recording, cut, None if (level := _FOLDER.fullmatch(self.by or "")) else self.by)
+            if level:
+                name = self._folder(recording.source, int(level[1]))
+                found = tuple(replace(touch, material=name) for touch in found)
+        breaks = [] if self.rate == "keep" else recording.breaks(learner.sensor)
+        return tuple(piece for touch in found for piece in _pieces(touch, breaks, learner.sensor))
+
+    def _folder(self, source: str, level: int) -> str:
+        """The name of a folder above a source, counted from the path that was typed. Raises InputError for none."""
+        folders = self.folders(source)
+        if not 0 < level <= len(folders):
             there = ", ".join(f"by='folder:{i + 1}', {name}" for i, name in enumerate(folders))
-            raise InputError(f"it has no folder {level[1]}; expected {there or 'by=file'}", argument="by")
-        name = folders[int(level[1]) - 1]
-        return recording, tuple(replace(touch, material=name) for touch in touches(recording, cut))
+            raise InputError(f"it has no folder {level}; expected {there or 'by=file'}", argument="by")
+        return folders[level - 1]
+
+
+def _pieces(touch: Touch, breaks: Sequence[int], sensor: Sensor) -> Iterator[Touch | Refused]:
+    """A touch, or those parts of it between breaks that are long enough; it is refused where none is."""
+    inside = [at for at in breaks if touch.begin < at < touch.end]
+    parts = list(pairwise([touch.begin, *inside, touch.end]))
+    long = [part for part in parts if not inside or part[1] - part[0] >= max(2, SHORTEST * sensor.rate)]
+    if not long:
+        why = (
+            f"gaps in its times, or steps back, leave {len(parts)} parts of it, none of {SHORTEST:g} s: give another "
+            "clock=, or take it in one, rate='keep'"
+        )
+        yield Refused(stored_source(f"{touch.source}[{touch.begin}:{touch.end}]"), why, "clock rate")
+    for begin, end in long:
+        own = slice(begin - touch.begin, end - touch.begin)
+        yield replace(touch, begin=begin, end=end, readings=touch.readings[own], times=touch.times[own])
 
 
 def _contacts(learner: TactileLearner, recording: Recording) -> list[tuple[int, int]]:
@@ -184,7 +256,7 @@ def _contacts(learner: TactileLearner, recording: Recording) -> list[tuple[int, 
     sensor, rest = learner.sensor, capabilities_of(learner.embedding).rest
     gaps = [gap.index for gap in recording.report.gaps]
     if recording.readings[:1].size != sensor.channels:
-        recording.stream(sensor)
+        recording.numbers(sensor)
     kind = np.float32 if sensor.camera else np.float64
     readings = recording.readings.reshape(len(recording), *sensor.shape).astype(kind, copy=False)
     spans = contact_spans(sensor, rest, readings, gaps)
@@ -214,14 +286,20 @@ class Refused:
     @classmethod
     def by(cls, error: Exception, source: str) -> Refused:
         """What an error refuses."""
-        return cls(source, str(error), getattr(error, "argument", None))
+        return cls(source, str(error).removeprefix(f"{source}: "), getattr(error, "argument", None))
+
+    def error(self) -> InputError:
+        """The error of a command that has this source alone."""
+        why = self.why if self.source in self.why else f"{self.source}: {self.why}"
+        return InputError(why, argument=self.argument)
 
 
 @dataclass(frozen=True)
 class SourceTouch:
     """A touch out of a source: where it comes from, what names it (None where nothing does), its stream, and its notes.
 
-    values, labels: as of `TactileLearner.observe`.
+    values, labels: as of `TactileLearner.observe`. facts: what is odd about it; with the first of a recording also what
+    is odd about that.
     """
 
     source: str
@@ -229,6 +307,7 @@ class SourceTouch:
     stream: Stream
     values: Mapping[str, float] = field(default_factory=dict)
     labels: Mapping[str, str] = field(default_factory=dict)
+    facts: Sequence[Fact] = ()
 
 
 def source_touches(
@@ -239,11 +318,15 @@ def source_touches(
     named: whether a touch that nothing names is refused.
     """
     try:
-        recording, found = options.touches_in(address, learner)
+        recording, facts = options.recording(address, learner.sensor)
+        found = options.touches_in(recording, learner)
     except (InputError, OSError) as error:
         yield Refused.by(error, address)
         return
     for touch in found:
+        if isinstance(touch, Refused):
+            yield touch
+            continue
         source = _source(recording, touch, options)
         try:
             material = options.material if options.material is not None else touch.material
@@ -253,7 +336,7 @@ def source_touches(
                     argument="material by intervals",
                 )
             part = replace(recording, readings=touch.readings, times=touch.times, episodes=())
-            stream = learner.stream(part.stream(learner.sensor))
+            stream = learner.stream(part.numbers(learner.sensor))
             noted = Noted(touch.values, touch.labels) + noted_in(recording.annotations, touch.begin, touch.end)
             name = None if material is None else require_name(material)
             yield SourceTouch(
@@ -262,7 +345,9 @@ def source_touches(
                 stream=stream,
                 values=_values(noted, learner.quantities),
                 labels=dict(noted.labels),
+                facts=(*facts, *learner._facts_of(stream, source=source)),
             )
+            facts = []
         except (InputError, SensorMismatchError) as error:
             yield Refused.by(error, source)
 

@@ -17,13 +17,14 @@ from pydantic_core import from_json
 from scroll_tactile_store import StoreError
 
 from scroll_tactile import __version__
-from scroll_tactile.clients.report.facts import MemoryFacts, mistakes
+from scroll_tactile.clients.report.memory_facts import MemoryFacts, mistakes
 from scroll_tactile.errors import InputError, ObservationError, ScrollTactileError
 from scroll_tactile.health.diagnosis import advice, in_words
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.libraries import optional
 from scroll_tactile.recordings import read
 from scroll_tactile.sensors import Sensor
+from scroll_tactile.signals.facts import told
 from scroll_tactile.signals.stream import Stream
 
 __all__ = ["serve"]
@@ -141,9 +142,12 @@ class _Tools:
         scene: list[Material] | None = None,
     ) -> dict[str, Any]:
         """Say of which material a touch is. scene: the materials that can be there; without it all that are known."""
-        touch = self.learner.stream(self.served.touch(self.learner.sensor, readings, file, topic, field, columns))
+        with told() as facts:
+            touch = self.learner.stream(self.served.touch(self.learner.sensor, readings, file, topic, field, columns))
+        facts += map(str, self.learner._facts_of(touch))
         answer = self.learner.predict(touch, scene=scene)
         found: dict[str, Any] = {**answer.as_json(), "seconds": answer.seconds, "unlike": answer.unusual}
+        found |= {"facts": facts} if facts else {}
         found["ranking"] = {name: round(chance, 6) for name, chance in answer.ranking[:RANKED]}
         if self.learner.quantities:
             found["quantities"] = {name: own.as_json() for name, own in self.learner.estimate(touch).items()}
@@ -188,9 +192,11 @@ class _Tools:
         columns: Columns = None,
     ) -> dict[str, Any]:
         """Learn that a touch is of this material, durably. Of what it had already nothing is learned twice."""
-        touch = self.learner.stream(self.served.touch(self.learner.sensor, readings, file, topic, field, columns))
-        receipt = self.learner.observe(material, touch, source=file)
-        return {"observation": receipt.sequence, "material": receipt.material, "repeated": receipt.repeated}
+        with told() as facts:
+            touch = self.learner.stream(self.served.touch(self.learner.sensor, readings, file, topic, field, columns))
+            receipt = self.learner.observe(material, touch, source=file)
+        found = {"observation": receipt.sequence, "material": receipt.material, "repeated": receipt.repeated}
+        return found | ({"facts": facts} if facts else {})
 
     def retract(self, observation: int) -> dict[str, Any]:
         """Take an observation out of the memory again, by the number that observe gave; as if it had never been."""

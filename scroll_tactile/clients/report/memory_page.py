@@ -20,7 +20,7 @@ from scroll_tactile.clients.report.channels import (
     health_section,
 )
 from scroll_tactile.clients.report.drawing import dated, shown
-from scroll_tactile.clients.report.facts import MOST_NEAR, Growing, MemoryFacts, bins_of, mistakes, unknown_by
+from scroll_tactile.clients.report.memory_facts import MOST_NEAR, Growing, MemoryFacts, bins_of, mistakes, unknown_by
 from scroll_tactile.clients.report.page import Card, State, cards, figure, lines, note, page, side_by_side, table
 from scroll_tactile.errors import printable
 from scroll_tactile.learner import TactileLearner

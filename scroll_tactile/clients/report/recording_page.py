@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from datetime import UTC, datetime
 from os import PathLike, fspath
 from pathlib import PurePosixPath
@@ -28,13 +31,17 @@ from scroll_tactile.clients.report.page import Card, State, cards, figure, lines
 from scroll_tactile.errors import FieldError, InputError, printable
 from scroll_tactile.live.detector import contact_spans
 from scroll_tactile.recordings import PRESETS, Contents, Interval, Recording, Touch, describe, read, touches
+from scroll_tactile.recordings.guessing import guessed_sensor
 from scroll_tactile.recordings.presets import find, names_for
 from scroll_tactile.sensors import Sensor, known
+from scroll_tactile.signals.facts import Fact, merged, touch_facts
 from scroll_tactile.signals.levels import LEVELS, MISSING, LevelArray
 
 __all__ = ["recording_page"]
 
 FloatArray = npt.NDArray[np.float64]
+
+_OPTION = re.compile(r"\b(rate|columns)='([^']*)'")  # of Python, which a command types otherwise
 
 MOST_READINGS = 1_000_000  # in which contacts are looked for
 STRETCHES = 40  # that a recording is cut into, to see in which of them a channel is still
@@ -60,7 +67,7 @@ def whose_readings(contents: Contents, recording: Recording, sensor: Sensor | No
     """
     if sensor is not None:
         if recording.readings[:1].size != sensor.channels:
-            recording.stream(sensor)
+            recording.numbers(sensor)
         return Whose(sensor, None, f"that of sensor {sensor.name}")
     if preset is not None:
         return Whose(find(preset).sensor, preset, f"that of preset {preset}")
@@ -129,7 +136,10 @@ def learning(
         words += ["--topic", recording.topic]
     if field and (usual is None or recording.topic is None or field != usual.field):
         words += ["--field", field]
-    words += [word for name in ("clock", "columns") if chosen.get(name) for word in (f"--{name}", str(chosen[name]))]
+    options = [name for name in ("clock", "columns", "definitions") if chosen.get(name)]
+    words += [word for name in options for word in (f"--{name}", str(chosen[name]))]
+    if whose.preset is None and not name:
+        missing[0] += f", which {shlex.join(['scroll-tactile', 'sensor', path, *words[6:]])} > sensor.json guesses"
     if cut.by == "labels":
         words += ["--labels", given.get("labels") or "labels.csv"]
         missing += [] if given.get("labels") else ["labels.csv, the table of its touches"]
@@ -141,6 +151,19 @@ def learning(
         return ""
     put_in = note(f" Put in: {'; '.join(missing)}.") if missing else ""
     return f"<h3>To learn it</h3>{lines([shlex.join(words)])}{put_in}"
+
+
+def odd(recording: Recording, whose: Whose, cut: Cutting) -> str:
+    """What is odd about it, by the rules that `learn` has, with their cures; of no known sensor by a guessed one."""
+    facts: list[Fact] = []
+    with suppress(InputError):  # pictures and missing values, of which the page says more elsewhere
+        sensor = whose.sensor or guessed_sensor([recording])[0]
+        facts += recording.facts(sensor)
+        for touch in cut.touches[:MOST_TOUCHES] or touches(recording):
+            part = replace(recording, readings=touch.readings, times=touch.times)
+            facts += touch_facts(part.numbers(sensor))
+    told = [_OPTION.sub(r"--\1 \2", replace(fact, source="").sentence) for fact in merged(facts)]
+    return "".join(map(note, told)) or note("Nothing that learning would speak of.")
 
 
 def recording_page(
@@ -163,7 +186,7 @@ def recording_page(
     """
     if sensor is not None and chosen.get("preset") is not None:
         raise InputError("give sensor= or preset=: both say whose readings they are", argument="sensor preset")
-    contents = describe(path)
+    contents = describe(path, definitions=chosen.get("definitions"))
     recording, chosen, why = _read(contents, fspath(path), chosen)
     whose = whose_readings(contents, recording, sensor, chosen.get("preset"))
     seen = _Seen.of(recording, whose.sensor)
@@ -172,6 +195,7 @@ def recording_page(
     sections = [
         ("signal", "Signal", side_by_side(_signal(recording, cut), f"<div>{_touches(recording, cut)}{words}</div>")),
         ("channels", "Channels", _channels(seen, whose)),
+        ("odd", "What is odd", odd(recording, whose, cut)),
         ("time", "Time", _time(recording)),
         ("holds", "What the file has", _holds(contents)),
     ]

@@ -17,10 +17,11 @@ from scroll_tactile.live.answers import LiveState, LiveTouch
 from scroll_tactile.live.session import HealthNotes
 from scroll_tactile.persistence.observations import refusal
 from scroll_tactile.recordings.paths import FieldPath
+from scroll_tactile.recordings.reader import reported
 from scroll_tactile.recordings.rosbag import picture
 from scroll_tactile.results import Estimate, Prediction, Receipt
 from scroll_tactile.settings import candidates_of
-from scroll_tactile.signals.ranges import all_clipped
+from scroll_tactile.signals.facts import all_clipped, told
 from scroll_tactile.signals.stream import Stream
 
 __all__ = ["Answer", "Bridge", "BridgeReport"]
@@ -29,6 +30,7 @@ Answer = Mapping[str, Any]
 """An answer by name, as JSON has it; `Bridge` lists what is in it."""
 
 RESTLESS = "the sensor is not at rest, or something touches it: nothing is found until it is left alone for two seconds"
+MEASURED = 200  # messages, by whose stamps the topic's rate is known
 RANKED = 5  # materials of an answer's ranking
 _FILE = re.compile(r"\w[\w.-]{0,99}", re.ASCII)  # a name that leads to no other folder
 _NUMBER = re.compile(r"[0-9]{1,19}")  # of a row: no journal has more, and int() refuses thousands of digits
@@ -104,6 +106,7 @@ class Bridge:
         self._ahead = 0.0  # of when a message is published, by its stamp
         self._warned: set[type[Exception]] = set()
         self._restless = False
+        self._stamps: list[float] = []  # the first
 
     def receive(self, message: object, published: float) -> LiveState:
         """Take the reading of a message, published at this time in seconds, and say where the session stands.
@@ -125,11 +128,23 @@ class Bridge:
                 self._warn(f"{error}. Further messages like it are left out and counted, without a word")
             return self.state
         self.stamp = stamp
+        if len(self._stamps) < MEASURED:
+            self._stamps.append(stamp)
+            self._measure()
         self._publish(state)
         if self.session.report.restless != self._restless:
             self._restless = self.session.report.restless
             self._warn(RESTLESS if self._restless else "the sensor was at rest: touches are found from now on")
         return state
+
+    def _measure(self) -> None:
+        """Warn where the first stamps say another rate than the sensor has."""
+        if len(self._stamps) < MEASURED:
+            return
+        report = reported(np.array(self._stamps), "header", {}, np.empty(0, np.int64), 0)
+        for fact in report.facts(self.learner.sensor, "the topic"):
+            if fact.kind == "rate":
+                self._warn(f"the topic: {fact.text}. Its readings are brought to the sensor's rate")
 
     def _reading(self, message: object) -> npt.NDArray[Any]:
         found = picture(message) if self._pictures else None
@@ -242,7 +257,10 @@ class Bridge:
         touch = self._ended_touch("to learn")
         if (why := refusal(self.learner.names_of(touch), material, all_clipped(touch))) is not None:
             raise InputError(f"{why}, or touch it again")
-        receipt = self.receipt = self.learner.observe(material, touch)
+        with told() as facts:
+            receipt = self.receipt = self.learner.observe(material, touch)
+        for fact in facts:
+            self._warn(f"{receipt.material}: {fact}")
         if receipt.repeated:
             return f"{receipt.material}: the last touch was learned already, as observation {receipt.sequence}"
         self._learned.append(receipt)

@@ -73,7 +73,7 @@ class Delimited(Source):
 
     def __init__(self, path: Path, address: str, request: Request) -> None:
         super().__init__(path, address, request)
-        self.budget.add(stored_bytes(path))
+        self.stored += stored_bytes(path)
         if request.decimal not in (".", ","):
             raise RecordingError(
                 f"expected a decimal point or comma, decimal='.' or ','; came {request.decimal!r}", argument="decimal"

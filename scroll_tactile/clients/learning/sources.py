@@ -57,8 +57,8 @@ _BY = ("topic", "file", "folder", "task")
 class SourceOptions:
     """How sources are read, cut into touches, and named.
 
-    topic, field, clock, columns, definitions, preset, labels, annotate: as of `recordings.read`. cut: None cuts by the
-    intervals where there are some, by episodes where a recording has some, and not otherwise.
+    topic, field, clock, columns, definitions, delimiter, decimal, preset, labels, annotate: as of `recordings.read`.
+    cut: None cuts by the intervals where there are some, by episodes where a recording has some, and not otherwise.
     material: the name of all touches. by: what names each touch, as of `recordings.touches`, or "folder:2", the second
     folder below one of `tops`, see `among`. intervals: the table's. At most one of the three names them; without any,
     episodes name themselves. quantities: that are declared before anything is learned, as the table's headings do
@@ -79,6 +79,8 @@ class SourceOptions:
     clock: str | None = None
     columns: str | None = None
     definitions: Mapping[str, str] | Path | None = None
+    delimiter: str | None = None
+    decimal: str | None = None
     preset: str | None = None
     labels: str | None = None
     annotate: Sequence[str] = ()
@@ -193,6 +195,8 @@ class SourceOptions:
             clock=self.clock,
             columns=self.columns,
             definitions=self.definitions,
+            delimiter=self.delimiter,
+            decimal=self.decimal,
             preset=self.preset,
             rate=sensor.rate,  # where it has no clock
             labels=self.labels,

@@ -11,11 +11,11 @@ from rich.console import Console
 from touches import PAD, SMALL
 from typer.testing import CliRunner
 
-from examples.benchmarks.shift import simulated_shift
 from scroll_tactile import Kernels, TactileLearner, sensors
 from scroll_tactile.clients.cli import everyday
 from scroll_tactile.clients.cli.terminal import Reading
 from scroll_tactile.simulation.scene import Scene
+from scroll_tactile.simulation.shift import simulated_shift
 
 SCENE = Scene(sensors.ROBOSKIN)
 SHIFT = simulated_shift(SCENE, ["silk", "wool"], seconds=22)

@@ -22,7 +22,6 @@ else:
 # Not through a link, nor waiting for whoever might write into a pipe. Windows has neither.
 CAREFULLY = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 
-BLOCK = 512  # bytes, of st_blocks
 SPARE, RATIO = 64 * 2**20, 16  # what a file may claim beyond its bytes on the disk
 
 
@@ -151,7 +150,7 @@ def open_regular(path: Path, flags: int) -> int:
 def dense_size(descriptor: int, path: Path) -> int:
     """Return the bytes of an open file. Raises DamageError where next to nothing of them is on the disk."""
     found = os.fstat(descriptor)
-    stored = getattr(found, "st_blocks", 0) * BLOCK  # 0 also where the file system does not tell
+    stored = 512 * getattr(found, "st_blocks", 0)  # 0 also where the file system does not tell
     if stored and found.st_size > SPARE + RATIO * stored:
         raise DamageError(
             f"{path} says that it has {found.st_size} bytes, and {stored} are on the disk: nothing of it was read. In "

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from scroll_tactile.errors import FieldError, RecordingError, ScrollTactileError
-from scroll_tactile.recordings.blocks import Block, Contents, Entry, Request, rows_of
+from scroll_tactile.recordings.blocks import Block, Contents, Entry, Request, in_seconds, is_clock, rows_of
 from scroll_tactile.recordings.paths import FieldPath
-from scroll_tactile.recordings.text import FEWEST, Text, in_seconds, is_time, moment
+from scroll_tactile.recordings.text import FEWEST, Text, moment
 
 __all__ = ["SUFFIXES", "JsonFile"]
 
@@ -50,7 +50,7 @@ class JsonFile(Text):
         several = path.suffix.lower() != ".json" or any(line.strip() for line in more)
         self.by_line = several and first.strip() not in ("[", "{") and any(map(_is_whole, (first, *more[:2])))
         self.path_to, self.clock, self.width = (request.field or "").strip(), request.clock, 0
-        self.paths: dict[str, FieldPath] = {}
+        self.collected: dict[str, FieldPath] = {}
 
     @classmethod
     def holds_some(cls, path: Path) -> bool:
@@ -121,6 +121,7 @@ class JsonFile(Text):
                     label = name if self.request.labels is None else self._found(message, self.request.labels)[0]
                     if several and (f"{row} {place}" if place else "", label) != before:
                         before, number, index = (f"{row} {place}" if place else "", label), number + 1, 0
+                        self.paths[number] = place.replace(".", "/")
                         self.names |= {number: self.named(label)} if isinstance(label, str) and label.strip() else {}
                     yield (*taken, number, index)
                     index += 1
@@ -143,7 +144,7 @@ class JsonFile(Text):
 
     def _time(self, message: Any, times: list[Any]) -> float | None:
         if self.clock is None and isinstance(message, dict):
-            self.clock = next((key for key in message if is_time(key)), "")
+            self.clock = next((key for key in message if is_clock(key)), "")
         found = self._found(message, self.clock) if self.clock and isinstance(message, dict) else times
         time = found[0] if found else None
         if found and not isinstance(time, float) and (time := moment(str(found[0]))) is None:
@@ -156,9 +157,9 @@ class JsonFile(Text):
             return [message]
         if isinstance(message, dict) and path in message:
             return [message[path]]
-        if path not in self.paths:
-            self.paths[path] = FieldPath(path)
-        return self.paths[path].values(message)
+        if path not in self.collected:
+            self.collected[path] = FieldPath(path)
+        return self.collected[path].values(message)
 
     def _leads(self, place: str, rows: list[Any]) -> bool:
         """Whether the field leads to something in a list's elements, or is the place of a list of numbers."""
@@ -215,7 +216,7 @@ def _lists(value: Any, leads: Callable[[str, list[Any]], bool], place: str = "")
             for i, inner in enumerate(value):
                 yield from _lists(inner, leads, f"{place}[{i}]") if isinstance(inner, dict | list) else ()
     elif isinstance(value, dict):
-        times = next((own for key, own in value.items() if is_time(key) and isinstance(own, list)), [])
+        times = next((own for key, own in value.items() if is_clock(key) and isinstance(own, list)), [])
         name = next((value[key] for key in _NAMES if isinstance(value.get(key), str)), None)
         for key, inner in value.items():
             for at, rows, own, called in _lists(inner, leads, f"{place}.{key}" if place else key):
@@ -246,7 +247,7 @@ def _leaves(value: Any, before: str) -> Iterator[tuple[str, tuple[int, ...]]]:
     start, alone = f"{before}." if before else "", []
     for key, inner in value.items():
         if isinstance(inner, int | float):
-            alone += [key] if key.isidentifier() and not is_time(key) and key not in _COUNTERS else []
+            alone += [key] if key.isidentifier() and not is_clock(key) and key not in _COUNTERS else []
         elif _are_rows(inner):
             yield from ((name, (len(inner), *shape)) for name, shape in _leaves(inner[0], f"{start}{key}[*]"))
         elif inner:

@@ -171,6 +171,31 @@ def test_a_decision_that_the_whole_touch_takes_back_is_called_revised():
         assert (live.report.touches, live.report.revised) == (2, 1)
 
 
+def test_a_decision_is_revised_where_the_whole_touch_cannot_tell_any_more():
+    random = np.random.default_rng(2)
+    touch = slide("a", 50, random)
+    touch[20:] = np.clip(touch[20:] + 0.3 * random.standard_normal(touch[20:].shape), 0, 1)
+    with learner(repetitions=7).live(contact="manual", risk=0.3) as live:
+        live.begin()
+        now = live.push(touch[:20])
+        live.push(touch[20:])
+        (ended,) = live.end().touches
+    assert now.decided and now.prediction.known is True
+    assert ended.decided and ended.prediction.known is None and ended.revised == now.prediction
+
+
+def test_an_answer_says_how_old_it_is():
+    with learner().live(contact="manual", risk=1e-12) as live:
+        assert live.push(rest(10, RANDOM)).age == live.begin().age == 0
+        shown, states = [], [live.push(row) for row in slide("a", 60, RANDOM)]
+        assert live.end().age == 0
+    for before, now in zip([None, *states], states, strict=False):
+        fresh = now.prediction is not None and (before is None or now.prediction is not before.prediction)
+        shown += [now.age] if fresh else []
+        assert now.age == (0 if fresh or now.prediction is None else pytest.approx(before.age + 1 / PAD.rate))
+    assert len(shown) > 1
+
+
 def test_what_stays_undecided_says_so():
     with learner().live(contact="manual") as live:
         ended = touched(live, np.random.default_rng(0).uniform(0, 1, (50, 2)))

@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import zarr
-from numcodecs import BZ2, LZ4, Blosc, GZip, Zlib, Zstd
+from numcodecs import LZ4, Blosc, GZip, Zlib, Zstd
 
 RNG = np.random.default_rng(3)
 TIP = RNG.standard_normal((30, 19)).astype(np.float32)
@@ -128,7 +128,6 @@ CODECS = {
     "bits": Blosc("zstd", shuffle=Blosc.BITSHUFFLE),
     "gzip": GZip(),
     "zlib": Zlib(),
-    "bz2": BZ2(),
     "frame": LZ4(),
     "zstd": Zstd(),
 }

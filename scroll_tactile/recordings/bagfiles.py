@@ -1,30 +1,33 @@
-"""Messages out of the files of ROS, `.bag`, `.mcap` and `.db3`, in the order they were written.
+"""Messages out of the files of ROS, in the order they were written: `.bag`, `.mcap` and `.db3`.
 
-Files are read from their beginning, a chunk at a time, and never by their index. So one that was cut off, by a power
-cut or a full disk, gives its whole messages up to there, and a large one needs no more memory than its largest chunk.
+rosbags goes by an index at a file's end, and of a file that a power cut ended it has nothing. So `.bag` and `.mcap` are
+read from their beginning, record by record, and give each whole message; SQLite reads `.db3`.
 """
 
 from __future__ import annotations
 
 import bz2
 import os
-import re
 import shutil
 import struct
+import sys
 import tempfile
 import zlib
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing, suppress
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
 from scroll_tactile.errors import InputError, RecordingError
-from scroll_tactile.libraries import missing
-from scroll_tactile.recordings.bounds import LARGEST, Budget
+from scroll_tactile.libraries import optional
+from scroll_tactile.recordings.bounds import RATIO, SPARE, on_disk, require_file
 
-__all__ = ["Channel", "Message", "Scan", "inflated", "scan_bag", "scan_db3", "scan_mcap"]
+__all__ = ["ZSTD", "Channel", "Message", "Scan", "inflated"]
+
+ZSTD, _LZ4, _BZIP2 = b"\x28\xb5\x2f\xfd", b"\x04\x22\x4d\x18", b"BZh"
+"""What anything begins with that was compressed so."""
 
 
 @dataclass(frozen=True)
@@ -50,316 +53,237 @@ class Message(NamedTuple):
 
 
 class Scan:
-    """What a scan is to give, and how it went.
+    """The messages of one file, and how reading it went.
 
-    wanted: whether messages of a topic are wanted; those of others are passed over. budget: what it may cost.
-    cut_off: why the file ends before its end. damaged: how many chunks inside it could not be read.
+    wanted: whether messages of a topic are wanted; those of others are passed over. room: how many bytes a chunk or a
+    message may claim to be. cut_off: why the file ends before its end. damaged: how many chunks could not be read.
+
+    Raises RecordingError for what is no file, and for one that is little but a hole.
     """
 
-    def __init__(self, wanted: Callable[[str], bool], budget: Budget) -> None:
-        self.wanted, self.budget = wanted, budget
+    def __init__(self, path: Path, wanted: Callable[[str], bool]) -> None:
+        about = require_file(path)
+        self.path, self.size, self.wanted = path, about.st_size, wanted
         self.cut_off: str | None = None
         self.damaged = 0
+        self.room = SPARE + RATIO * on_disk(about)
+        if self.size > self.room:
+            raise RecordingError(f"{path} claims {self.size} bytes, of which {on_disk(about)} are there: copy it again")
+
+    def messages(self) -> Iterator[Message]:
+        """Raises RecordingError for a file that does not begin as its name says, or claims more than it can hold."""
+        name = self.path.name.lower().removesuffix(".active")
+        if name.endswith(".zstd"):
+            with tempfile.TemporaryDirectory() as folder:
+                inside = Scan(_unzipped(self, Path(folder)), self.wanted)
+                yield from inside.messages()
+            self.cut_off, self.damaged = inside.cut_off, inside.damaged
+        elif name.endswith(".db3"):
+            yield from _scan_db3(self)
+        else:
+            yield from (_Bag if name.endswith(".bag") else _Mcap)(self).scanned()
+
+    def opened(self, begin: bytes) -> BinaryIO:
+        """The file behind these bytes, with which it has to begin."""
+        file = self.path.open("rb")
+        if (found := file.read(len(begin))) == begin:
+            return file
+        file.close()
+        why = "it ends within that" if found and begin.startswith(found) else f"{found!r}" if found else "it is empty"
+        raise RecordingError(f"{self.path} does not begin as a {self.path.suffix} file does, with {begin!r}: {why}")
 
 
-class _CutOff(Exception):
-    """The bytes end in the middle of something."""
+def inflated(data: bytes, most: int, size: int | None = None) -> bytes:
+    """`data` decompressed, if it begins as Zstandard, LZ4 or bzip2 does; of what was cut off, as much as is there.
 
-
-_DAMAGE = (ValueError, RuntimeError, OSError, EOFError, KeyError, struct.error)  # what decompressors and parsers raise
-
-
-def _take(file: BinaryIO, size: int, end: int, budget: Budget) -> bytes:
-    """The next `size` bytes of `end`; raises _CutOff where there are fewer, before any memory is taken for them.
-
-    Raises RecordingError where the budget has no room for as many: what is left of a file may be a hole.
+    Raises RecordingError where it is more than `most` bytes, or claims a size beyond; MissingLibraryError.
     """
-    left = end - file.tell()
-    if size > min(left, LARGEST):
-        raise _CutOff(f"a record of {size} bytes is claimed where {left} are left")
-    budget.take(size)
-    return file.read(size)
-
-
-def _decompress(kind: str, data: bytes, size: int, budget: Budget, *, whole: bool) -> bytes:
-    """`data` decompressed, of `size` bytes; raises ValueError where they are not as many and it is `whole`.
-
-    Raises RecordingError where the budget has no room for as many, MissingLibraryError.
-    """
-    if size > LARGEST:
-        raise ValueError(f"a chunk of {size} bytes is claimed")
-    budget.take(size)
-    if kind in ("", "none"):
-        result = data
-    else:
-        decompressor = _decompressor(kind)
-        try:
-            result = decompressor.decompress(data, max_length=size)
-        except Exception as error:  # each library has errors of its own
-            raise ValueError(str(error)) from error
-    if whole and len(result) != size:
-        raise ValueError(f"a chunk of {size} bytes is claimed; there are {len(result)}")
-    return result
-
-
-def _decompressor(kind: str) -> Any:
-    if kind == "bz2":
-        return bz2.BZ2Decompressor()
-    if kind == "lz4":
-        try:
-            from lz4.frame import LZ4FrameDecompressor  # comes with rosbags
-        except ImportError as error:
-            raise missing("lz4", "ros", "a file compressed by lz4", cause=error) from error
-        return LZ4FrameDecompressor()
-    if kind == "zstd":
-        return _zstd().ZstdDecompressor()
-    raise RecordingError(f"chunks are compressed as {kind!r}; expected lz4, zstd or bz2")
+    found = data
+    if size is None or size <= most:
+        if data.startswith(ZSTD):
+            found = _zstd().ZstdDecompressor().decompress(data, max_length=most + 1)
+        elif data.startswith(_LZ4):
+            with optional("lz4", "ros", "a file compressed by lz4"):  # comes with rosbags
+                from lz4.frame import LZ4FrameDecompressor
+            found = LZ4FrameDecompressor().decompress(data, max_length=most + 1)
+        elif data.startswith(_BZIP2):
+            found = bz2.BZ2Decompressor().decompress(data, max_length=most + 1)
+        if len(found) <= most:
+            return found
+    raise RecordingError(
+        f"a chunk or message claims to have more than {most} bytes, too many for a file of this size: it may be "
+        "damaged. If it is not, write it with less compression, or in parts"
+    )
 
 
 def _zstd() -> Any:
-    """The module that decompresses Zstandard."""
-    try:
-        from compression import zstd  # type: ignore[import-not-found]  # Python 3.14
-    except ImportError:
-        try:
+    with optional("backports.zstd", "ros", "a file compressed by zstd"):  # comes with rosbags
+        if sys.version_info >= (3, 14):
+            from compression import zstd
+        else:
             from backports import zstd
-        except ImportError as error:
-            raise missing("backports.zstd", "ros", "a file compressed by zstd", cause=error) from error
     return zstd
 
 
-def inflated(path: Path, folder: Path, budget: Budget) -> Path:
-    """A whole file that was compressed by zstd, as it was before, in `folder`."""
-    target = folder / path.stem
-    with path.open("rb") as file, _zstd().open(file, "rb") as source, target.open("wb") as sink:
-        while part := source.read(1 << 20):
-            budget.take(len(part))
-            sink.write(part)
+def _unzipped(scan: Scan, folder: Path) -> Path:
+    """A file that was compressed whole, as it was before, in `folder`."""
+    target = folder / scan.path.stem
+    with scan.opened(ZSTD) as file, target.open("wb") as sink:
+        file.seek(0)
+        source = _zstd().open(file, "rb")
+        with suppress(EOFError):  # of what was cut off
+            while part := source.read(1 << 20):
+                if sink.tell() > scan.room:
+                    raise RecordingError(f"{scan.path} becomes more than {scan.room} bytes: decompress it yourself")
+                sink.write(part)
     return target
 
 
-# ROS 1: records of a header (fields name=value) and data; chunks hold records.
+# MCAP and ROS 1: records after records; chunks hold records.
 
-_BAG = b"#ROSBAG V2.0\n"
-_A_RECORD = 4  # steps of work
-_HEADER_A_STEP = 64  # bytes of a header; a field has five at least
-_LONGEST_HEADER = 1 << 20  # bytes; a message's definition is in one of them, and those of MoveIt take 100 KB
-_MESSAGE, _BAG_HEADER, _CHUNK, _CONNECTION = 2, 3, 5, 7
-
-
-def scan_bag(path: Path, scan: Scan) -> Iterator[Message]:
-    """The messages of a ROS 1 bag, indexed or not."""
-    size = path.stat().st_size
-    with path.open("rb") as file:
-        if file.read(len(_BAG)) != _BAG:
-            raise RecordingError(f"{path} does not begin as a ROS 1 bag does, with {_BAG.decode().strip()!r}")
-        reader = _Bag(scan)
-        try:
-            _index(file, size, reader)
-            while file.tell() < size:
-                header, length = _record_head(file, size, scan.budget)
-                left = size - file.tell()
-                if length > left and header.get(b"op") == bytes([_CHUNK]):
-                    yield from reader.chunk(header, _take(file, min(left, LARGEST), size, scan.budget), whole=False)
-                    raise _CutOff("it ends in the middle of a chunk")
-                yield from reader.record(header, _take(file, length, size, scan.budget))
-        except _CutOff as error:
-            scan.cut_off = str(error)
-
-
-def _record_head(file: BinaryIO, size: int, budget: Budget) -> tuple[dict[bytes, bytes], int]:
-    """A record's header, and how many bytes of data follow."""
-    (length,) = struct.unpack("<I", _take(file, 4, size, budget))
-    if length > _LONGEST_HEADER:
-        raise _CutOff(f"a record's header of {length} bytes is claimed")
-    header = _header(_take(file, length, size, budget), budget)
-    (length,) = struct.unpack("<I", _take(file, 4, size, budget))
-    return header, length
-
-
-def _header(data: bytes, budget: Budget) -> dict[bytes, bytes]:
-    """The fields of a header; raises _CutOff for what is none, RecordingError where the budget has no time for it."""
-    budget.work(len(data) // _HEADER_A_STEP)
-    fields: dict[bytes, bytes] = {}
-    i = 0
-    while i < len(data):
-        (length,) = struct.unpack_from("<I", data, i)
-        name, mark, value = data[i + 4 : i + 4 + length].partition(b"=")
-        if not mark:
-            raise _CutOff(f"a field of a record's header is {name!r:.60}; expected name=value")
-        fields[name] = value
-        i += 4 + length
-    return fields
-
-
-def _index(file: BinaryIO, size: int, reader: _Bag) -> None:
-    """Take the connections at the end of a whole bag: those in a damaged chunk are needed by later ones."""
-    begin, budget = file.tell(), reader.scan.budget
-    header, _ = _record_head(file, size, budget)
-    with suppress(*_DAMAGE, _CutOff):
-        (start,) = struct.unpack("<Q", header[b"index_pos"])
-        file.seek(start if 0 < start < size else size)
-        while file.tell() < size:
-            header, length = _record_head(file, size, budget)
-            if header[b"op"] != bytes([_CONNECTION]):
-                break
-            reader.connect(header, _take(file, length, size, budget))
-    file.seek(begin)
-
-
-class _Bag:
-    """Follows the connections of a ROS 1 bag from record to record."""
-
-    def __init__(self, scan: Scan) -> None:
-        self.scan = scan
-        self.channels: dict[bytes, Channel] = {}
-        self.total = 0
-
-    def record(self, header: dict[bytes, bytes], data: bytes) -> Iterator[Message]:
-        self.scan.budget.work(_A_RECORD)
-        kind = header.get(b"op", b"\0")[0]
-        if kind == _CHUNK:
-            yield from self.chunk(header, data, whole=True)
-        elif kind == _CONNECTION:
-            self.connect(header, data)
-        elif kind == _MESSAGE:
-            channel = self.channels.get(header[b"conn"])
-            self.total += 1
-            if channel is not None and self.scan.wanted(channel.topic):
-                seconds, nanoseconds = struct.unpack("<II", header[b"time"])
-                yield Message(channel, seconds * 10**9 + nanoseconds, None, None, self.total, data)
-
-    def chunk(self, header: dict[bytes, bytes], data: bytes, *, whole: bool) -> Iterator[Message]:
-        """The messages of a chunk; of one that was cut off, those before the cut."""
-        try:
-            (size,) = struct.unpack("<I", header[b"size"])
-            inside = _decompress(header[b"compression"].decode(), data, size, self.scan.budget, whole=whole)
-            chunk = BytesIO(inside)
-            while chunk.tell() < len(inside):
-                inner, length = _record_head(chunk, len(inside), self.scan.budget)
-                yield from self.record(inner, _take(chunk, length, len(inside), self.scan.budget))
-        except InputError:  # a library is missing, or there is more than such a file can hold
-            raise
-        except (*_DAMAGE, _CutOff):
-            self.scan.damaged += whole
-
-    def connect(self, header: dict[bytes, bytes], data: bytes) -> None:
-        fields = _header(data, self.scan.budget)
-        topic = header.get(b"topic", fields.get(b"topic", b"")).decode()
-        name = fields[b"type"].decode()
-        name = name if "/msg/" in name else name.replace("/", "/msg/", 1)
-        self.channels[header[b"conn"]] = Channel(topic, name, "ros1", fields[b"message_definition"].decode())
-
-
-# MCAP: records have a kind, a length and data; chunks hold records.
-
-_MAGIC = b"\x89MCAP0\r\n"
-_FOOTER, _SCHEMA, _CHANNEL, _MCAP_MESSAGE, _MCAP_CHUNK, _DATA_END = 2, 3, 4, 5, 6, 15
-_HEAD = struct.Struct("<BQ")
-_MCAP_HEAD = struct.Struct("<HIQQ")
-
-
-def scan_mcap(path: Path, scan: Scan) -> Iterator[Message]:
-    """The messages of an MCAP file, whole or cut off."""
-    size = path.stat().st_size
-    with path.open("rb") as file:
-        if file.read(len(_MAGIC)) != _MAGIC:
-            raise RecordingError(f"{path} does not begin as an MCAP file does")
-        reader = _Mcap(scan)
-        _summary(file, size, reader)
-        try:
-            while True:
-                scan.budget.work()
-                kind, length = _HEAD.unpack(_take(file, _HEAD.size, size, scan.budget))
-                left = size - file.tell()
-                if kind in (_FOOTER, _DATA_END):
-                    return
-                if kind not in (_SCHEMA, _CHANNEL, _MCAP_MESSAGE, _MCAP_CHUNK):
-                    if length > left:
-                        raise _CutOff("it ends in the middle of a record")
-                    file.seek(length, 1)
-                    continue
-                if kind == _MCAP_CHUNK and length > left:
-                    yield from reader.chunk(_take(file, min(left, LARGEST), size, scan.budget), whole=False)
-                    raise _CutOff("it ends in the middle of a chunk")
-                data = _take(file, length, size, scan.budget)
-                yield from reader.chunk(data, whole=True) if kind == _MCAP_CHUNK else reader.record(kind, data)
-        except _CutOff as error:
-            scan.cut_off = str(error)
-
-
-def _summary(file: BinaryIO, size: int, reader: _Mcap) -> None:
-    """Take the schemas and channels at the end of a whole file: those in a damaged chunk are needed by later ones."""
-    budget = reader.scan.budget
-    begin, tail = file.tell(), 9 + 20 + len(_MAGIC)  # a footer and the magic
-    file.seek(max(size - tail, begin))
-    footer = file.read(tail)
-    if len(footer) == tail and footer.endswith(_MAGIC) and footer[0] == _FOOTER:
-        (start,) = struct.unpack_from("<Q", footer, 9)
-        with suppress(*_DAMAGE, _CutOff):
-            file.seek(start if 0 < start < size else size)
-            while file.tell() < size - tail:
-                budget.work()
-                kind, length = _HEAD.unpack(_take(file, _HEAD.size, size, budget))
-                data = _take(file, length, size, budget)
-                if kind in (_SCHEMA, _CHANNEL):
-                    list(reader.record(kind, data))
-    file.seek(begin)
+_HEAD, _MESSAGE, _CHUNK = struct.Struct("<BQ"), struct.Struct("<HIQQ"), struct.Struct("<QQQI")
 
 
 class _Mcap:
-    """Follows the schemas and channels of an MCAP file from record to record."""
+    """Walks from record to record, in a file and in its chunks: a kind, a length, and data. `_Bag` does so in ROS 1's.
+
+    closed: whether the file was closed by its recorder.
+    """
+
+    begin, chunk = b"\x89MCAP0\r\n", 6
+    kinds: tuple[int, ...] = (3, 4, 5)  # schemas, channels and messages
 
     def __init__(self, scan: Scan) -> None:
-        self.scan = scan
-        self.schemas: dict[int, tuple[str, str, str]] = {}
+        self.scan, self.closed, self.total = scan, False, 0
         self.channels: dict[int, Channel] = {}
-        self.others: dict[int, int] = {}
-        self.total = 0
+        self.schemas: dict[int, tuple[str, str, str]] = {}
+        self.seen: dict[int, int] = {}
 
-    def chunk(self, data: bytes, *, whole: bool) -> Iterator[Message]:
-        """The messages of a chunk; of one that was cut off, those before the cut, which no checksum verifies."""
-        try:
-            size, checksum = struct.unpack_from("<QI", data, 16)
-            form, i = _text(data, 28)
-            (length,) = struct.unpack_from("<Q", data, i)
-            inside = _decompress(form, data[i + 8 : i + 8 + length], size, self.scan.budget, whole=whole)
-            if whole and checksum and zlib.crc32(inside) != checksum:
-                raise ValueError("its checksum does not verify")
-            i = 0
-            while i + _HEAD.size <= len(inside):
-                kind, length = _HEAD.unpack_from(inside, i)
-                i += _HEAD.size
-                self.scan.budget.work()
-                if i + length > len(inside):
-                    raise _CutOff("a record ends beyond its chunk")
-                yield from self.record(kind, inside[i : i + length])
-                i += length
-        except InputError:  # a library is missing, or there is more than such a file can hold
-            raise
-        except (*_DAMAGE, _CutOff):
-            self.scan.damaged += whole
+    def scanned(self) -> Iterator[Message]:
+        """The messages of the file."""
+        with self.scan.opened(self.begin) as file:
+            if index := self.index(file):  # a damaged chunk may hold channels that are needed by later ones
+                file.seek(index)
+                for _ in self.messages(file):
+                    pass
+            file.seek(len(self.begin))
+            whole = yield from self.messages(file)
+            if not (whole and self.closed):
+                self.scan.cut_off = "its recorder did not close it" if whole else "it ends in the middle of a record"
 
-    def record(self, kind: int, data: bytes) -> Iterator[Message]:
-        if kind == _MCAP_MESSAGE:
-            number, sequence, log, publish = _MCAP_HEAD.unpack_from(data)
+    def messages(self, file: BinaryIO) -> Generator[Message, None, bool]:
+        """Those from here on; returns whether the last record is whole."""
+        while (found := self.head(file)) is not None:
+            kind, header, length = found
+            if kind != self.chunk and kind not in self.kinds:
+                file.seek(min(length, self.scan.room), os.SEEK_CUR)
+                continue
+            data = file.read(min(length, self.scan.room))
+            whole = len(data) == length
+            if kind == self.chunk:
+                try:
+                    yield from self.messages(BytesIO(self.inside(data, whole=whole)))
+                except InputError:  # a library is missing, or the chunk claims too much
+                    raise
+                except Exception:  # whatever damage does to decompressors and parsers
+                    self.scan.damaged += whole
+            elif whole and (message := self.record(kind, header, data)) is not None:
+                yield message
+            if not whole:
+                return False
+        return True
+
+    def index(self, file: BinaryIO) -> int:
+        """Where channels are told once more, at the end of a file that was closed; 0 where they are not."""
+        file.seek(max(self.scan.size - 37, 0))  # a footer, and the letters of the beginning
+        footer = file.read()
+        return int.from_bytes(footer[9:17], "little") if footer[:1] == b"\2" and footer.endswith(self.begin) else 0
+
+    def head(self, file: BinaryIO) -> tuple[int, Any, int] | None:
+        """A record's kind, its header, and how many bytes follow; None where there is no further one."""
+        if len(head := file.read(_HEAD.size)) < _HEAD.size:
+            return None
+        kind, length = _HEAD.unpack(head)
+        if kind in (2, 15):  # a footer, or the end of data
+            self.closed = True
+            return None
+        return kind, None, length
+
+    def inside(self, data: bytes, *, whole: bool) -> bytes:
+        """The records in a chunk; of one that was cut off, those before the cut, which no checksum verifies."""
+        _, _, size, checksum = _CHUNK.unpack_from(data)
+        form, i = _text(data, _CHUNK.size)
+        if form not in ("", "zstd", "lz4"):
+            raise RecordingError(f"chunks are compressed as {form!r}; expected lz4 or zstd")
+        found = inflated(data[i + 8 :], self.scan.room, size)
+        if whole and (len(found) != size or (checksum and zlib.crc32(found) != checksum)):
+            raise ValueError("its length or checksum is another")
+        return found
+
+    def record(self, kind: int, _: Any, data: bytes) -> Message | None:
+        """The message in a record, if there is one and it is wanted."""
+        if kind == 5:
+            number, sequence, log, publish = _MESSAGE.unpack_from(data)
             channel = self.channels.get(number)
             self.total += 1
             if channel is not None and self.scan.wanted(channel.topic):
-                self.others[number] = self.others.get(number, 0) + 1
-                foreign = self.total - self.others[number]
-                yield Message(channel, log, publish, sequence, foreign, data[_MCAP_HEAD.size :])
-        elif kind == _SCHEMA:
+                seen = self.seen[number] = self.seen.get(number, 0) + 1
+                return Message(channel, log, publish, sequence, self.total - seen, data[_MESSAGE.size :])
+        elif kind == 3:
             name, i = _text(data, 2)
             form, i = _text(data, i)
-            self.schemas[struct.unpack_from("<H", data)[0]] = (name, form, _text(data, i)[0])
-        elif kind == _CHANNEL:
+            self.schemas[int.from_bytes(data[:2], "little")] = (name, form, _text(data, i)[0])
+        else:
             number, schema = struct.unpack_from("<HH", data)
+            name, form, definition = self.schemas.get(schema, ("", "", ""))
             topic, i = _text(data, 4)
             encoding, _ = _text(data, i)
-            name, form, definition = self.schemas.get(schema, ("", "", ""))
-            name = name if "/msg/" in name else name.replace("/", "/msg/", 1)
-            self.channels[number] = Channel(topic, name, encoding, definition, form == "ros2idl")
+            self.channels[number] = Channel(topic, _ros2(name), encoding, definition, form in ("ros2idl", "omgidl"))
+        return None
+
+
+class _Bag(_Mcap):
+    """The same of ROS 1: a record has a header of fields, which rosbags reads."""
+
+    begin, chunk = b"#ROSBAG V2.0\n", 5
+    kinds = (2, 7)  # messages and connections
+
+    def __init__(self, scan: Scan) -> None:
+        super().__init__(scan)
+        with optional("rosbags", "ros", "a ROS recording"):
+            from rosbags.rosbag1 import reader
+        self.ros: Any = reader
+
+    def index(self, file: BinaryIO) -> int:
+        with suppress(self.ros.ReaderError):
+            found: int = self.ros.Header.read(file).get_uint64("index_pos")
+            self.closed = 0 < found < self.scan.size
+        return found if self.closed else 0
+
+    def head(self, file: BinaryIO) -> tuple[int, Any, int] | None:
+        try:
+            header = self.ros.Header.read(file)
+            return header.get_uint8("op"), header, self.ros.read_uint32(file)
+        except self.ros.ReaderError:  # of the end, and of what is none
+            return None
+
+    def inside(self, data: bytes, *, whole: bool) -> bytes:
+        return inflated(data, self.scan.room)
+
+    def record(self, kind: int, header: Any, data: bytes) -> Message | None:
+        number = header.get_uint32("conn")
+        if kind == 7:
+            about = self.ros.Header.read(BytesIO(struct.pack("<I", len(data)) + data))
+            kinds = _ros2(about.get_string("type")), "ros1", about.get_string("message_definition")
+            self.channels[number] = Channel(header.get_string("topic"), *kinds)
+        elif (channel := self.channels.get(number)) is not None and self.scan.wanted(channel.topic):
+            return Message(channel, header.get_time("time"), None, None, 0, data)
+        return None
+
+
+def _ros2(name: str) -> str:
+    """The name of a type of ROS 1, as ROS 2 has them."""
+    return name.replace("/", "/msg/", 1) if name.count("/") == 1 else name
 
 
 def _text(data: bytes, i: int) -> tuple[str, int]:
@@ -369,113 +293,71 @@ def _text(data: bytes, i: int) -> tuple[str, int]:
 
 # SQLite, as ROS 2 had it before MCAP.
 
-_INSTRUCTIONS, _A_STEP = 20_000, 100  # of SQLite between two looks at their number; and in the time of a step of Python
-_TABLES = ("topics", "messages", "message_definitions")
-_TABLE = re.compile(r"CREATE TABLE\b", re.IGNORECASE)
+_SQLITE = b"SQLite format 3\0"
 
 
-def scan_db3(path: Path, scan: Scan, *, compressed: bool = False) -> Iterator[Message]:
-    """The messages of a ROS 2 SQLite file, in the order they were written; `compressed`: each by itself, by zstd."""
+def _scan_db3(scan: Scan) -> Iterator[Message]:
     import sqlite3
 
-    with ExitStack() as stack:
-        budget = scan.budget
-        base = stack.enter_context(closing(_connect(_whole_pages(path, scan, stack))))
-        _bound(base, budget)
+    with tempfile.TemporaryDirectory() as folder, closing(_database(_whole_pages(scan, Path(folder)))) as base:
+        base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, min(scan.room, 2**31 - 1))
         try:
             channels = _channels(base)
         except sqlite3.DatabaseError as error:
-            budget.work(0)
-            raise RecordingError(f"{path} cannot be read as a ROS 2 bag, and may be damaged: {error}") from error
-        wanted = [number for number, channel in channels.items() if scan.wanted(channel.topic)]
-        marks = ",".join("?" * len(wanted))
-        query = f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({marks}) ORDER BY id"
+            raise RecordingError(f"{scan.path} cannot be read as a ROS 2 bag, and may be damaged: {error}") from error
+        wanted = ",".join(str(number) for number, channel in channels.items() if scan.wanted(channel.topic))
+        query = f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({wanted}) ORDER BY id"
         try:
-            for number, log, stored in base.execute(query, wanted):
-                if not isinstance(stored, bytes) or not isinstance(log, int):
+            for number, log, data in base.execute(query):
+                if isinstance(data, bytes) and isinstance(log, int):
+                    yield Message(channels[number], log, None, None, 0, data)
+                else:
                     scan.damaged += 1
-                    continue
-                budget.work()
-                most = budget.room() + 1
-                data = _zstd().ZstdDecompressor().decompress(stored, max_length=most) if compressed else stored
-                budget.take(len(data))
-                yield Message(channels[number], log, None, None, 0, data)
         except sqlite3.DatabaseError as error:
-            budget.work(0)
             scan.cut_off = str(error)
 
 
-def _bound(base: Any, budget: Budget) -> None:
-    """SQLite stops where a query costs more than a file of this size can ask for: a forged one can ask for ever."""
-    import sqlite3
-
-    def count() -> bool:
-        try:
-            budget.work(_INSTRUCTIONS // _A_STEP)
-        except RecordingError:
-            return True
-        return False
-
-    base.set_progress_handler(count, _INSTRUCTIONS)
-    base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, min(LARGEST, budget.room()))
-    base.setlimit(sqlite3.SQLITE_LIMIT_ATTACHED, 0)
-
-
-def _whole_pages(path: Path, scan: Scan, stack: ExitStack) -> Path:
+def _whole_pages(scan: Scan, folder: Path) -> Path:
     """A file that ends inside a page without that page, as a copy: SQLite would read zeros for what is missing."""
-    with path.open("rb") as file:
-        head = file.read(100)
-    if head[:16] != b"SQLite format 3\0" or len(head) < 100:
-        raise RecordingError(f"{path} does not begin as an SQLite file does")
-    page = int.from_bytes(head[16:18], "big")
-    page = 65536 if page == 1 else page
-    size = path.stat().st_size
-    if page < 512 or size % page == 0:
-        return path
+    with scan.opened(_SQLITE) as file:
+        page = int.from_bytes(file.read(2), "big")
+    rest = scan.size % (65536 if page == 1 else max(page, 1))
+    if not rest:
+        return scan.path
     scan.cut_off = "it ends in the middle of a page"
-    scan.budget.take(size)
-    target = Path(stack.enter_context(tempfile.TemporaryDirectory())) / path.name
-    shutil.copyfile(path, target)
-    os.truncate(target, size - size % page)
-    return target
+    shutil.copyfile(scan.path, folder / scan.path.name)
+    os.truncate(folder / scan.path.name, scan.size - rest)
+    return folder / scan.path.name
 
 
-def _connect(path: Path) -> Any:
+def _database(path: Path) -> Any:
     import sqlite3
 
-    address = path.resolve().as_uri()
+    why: Exception | None = None
     for mode in ("mode=ro", "mode=ro&immutable=1"):  # a write-ahead log cannot be read where nothing may be written
-        base = sqlite3.connect(f"{address}?{mode}", uri=True)
+        base = sqlite3.connect(f"{path.resolve().as_uri()}?{mode}", uri=True, timeout=1)
         base.text_factory = lambda data: data.decode(errors="replace")
         try:
             base.execute("PRAGMA trusted_schema=OFF")
             base.execute("PRAGMA writable_schema=ON")  # otherwise SQLite gives nothing of a file that was cut off
             base.execute("SELECT 1 FROM sqlite_master").fetchone()
             return base
-        except sqlite3.OperationalError:
-            base.close()
         except sqlite3.DatabaseError as error:
             base.close()
-            raise RecordingError(f"{path} cannot be read as a ROS 2 bag, and may be damaged: {error}") from error
-    raise RecordingError(f"{path} cannot be opened as an SQLite file: is it being written, or readable at all?")
+            why = error
+    raise RecordingError(f"{path} cannot be read as a ROS 2 bag: is it being written, or damaged? ({why})") from why
 
 
 def _channels(base: Any) -> dict[int, Channel]:
-    tables: set[str] = set()
-    for kind, name, sql in base.execute("SELECT type, name, sql FROM sqlite_master"):
-        # A view may pose as a table, and a column may be computed or hidden when it is read.
-        if str(name).lower() in _TABLES:
-            columns = base.execute("SELECT * FROM pragma_table_xinfo(?)", (name,))
-            if kind != "table" or not _TABLE.match(str(sql)) or any(hidden for *_, hidden in columns):
-                raise RecordingError(f"{name} is no table as a ROS 2 bag has it: {str(sql)!r:.100}")
-        tables |= {str(name)} if kind == "table" else set()
+    tables = {name for (name,) in base.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
     if not {"topics", "messages"} <= tables:
-        raise RecordingError(f"expected the tables topics and messages of a ROS 2 bag; there are {sorted(tables)[:20]}")
+        there = sorted(map(str, tables))[:20]
+        raise RecordingError(f"expected the tables topics and messages of a ROS 2 bag; there are {there}")
     definitions = {}
     if "message_definitions" in tables:  # since ROS 2 Iron
         query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
         definitions = {name: (str(text), form == "ros2idl") for name, form, text in base.execute(query)}
     return {
-        number: Channel(str(topic), str(name), str(form), *definitions.get(name, ("", False)))
+        int(number): Channel(str(topic), str(name), str(form), *definitions.get(name, ("", False)))
         for number, topic, name, form in base.execute("SELECT id, name, type, serialization_format FROM topics")
     }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -14,13 +15,17 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import FieldError, RecordingError, ScrollTactileError
-from scroll_tactile.recordings.bounds import Budget
+from scroll_tactile.recordings.bounds import Budget, require_bounded
 
-__all__ = ["Block", "Contents", "Entry", "Request", "Source", "floats", "guarded", "rows_of"]
+__all__ = ["Block", "Contents", "Entry", "Request", "Source", "floats", "guarded", "in_seconds", "is_clock", "rows_of"]
 
 _MESSAGE = 8000  # letters of an error
 _ROWS = 4096  # of a block …
 _BYTES = 1 << 24  # … unless they would hold more than this
+_TIME = re.compile(
+    r"(?:time(?:[ _]?stamp)?s?|t|ts|stamps?|seconds)(?:[ _]*[\[(]?(s|sec|seconds|ms|us|µs|ns)[\])]?)?", re.IGNORECASE
+)
+_UNITS = {"ms": 1e3, "us": 1e6, "µs": 1e6, "ns": 1e9}
 
 
 @dataclass(frozen=True)
@@ -118,10 +123,11 @@ class Source(ABC):
     path, address: where it is on this machine, and as it was given. request: what is requested of it.
     topic: the topic that is read; None where the format has none.
     notes: what went wrong without losing everything, as sentences. cut_off: whether the file ends before its end.
-    names: what each episode is called, by its number.
+    names: what each episode is called, by its number. paths: where in the file it lies, by the same number, such as
+    "run/felt/1/tactile", where a pattern found it.
     marks: the texts of a topic of labels, each with its time in seconds by the clock "log".
     continuous: whether time goes on from one episode to the next, and does not begin anew.
-    budget: what reading it may still cost.
+    budget: what reading it may still cost. stored: its bytes on the disk. claimed: those that it becomes in memory.
     topics, labels, annotate: whether the format has topics, something that labels, and columns beside the readings.
     """
 
@@ -131,14 +137,24 @@ class Source(ABC):
         self.path, self.address, self.request = path, address, request
         self.topic = request.topic
         self.budget = Budget(address)
+        self.stored = self.claimed = 0
         self.notes: list[str] = []
         self.cut_off = False
         self.names: dict[int, str] = {}
+        self.paths: dict[int, str] = {}
         self.marks: list[tuple[float, str]] = []
 
     def field(self) -> str:
         """The field that is read, as far as it is known before reading."""
         return self.request.field or ""
+
+    def claim(self, size: int) -> None:
+        """Say that a buffer of so many bytes will be made, for what the file says of itself.
+
+        Raises RecordingError where all of them are more than a file of its size can hold.
+        """
+        self.claimed += size
+        require_bounded(self.claimed, self.stored, self.address)
 
     @abstractmethod
     def contents(self) -> Contents:
@@ -165,6 +181,21 @@ def floats(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
         return array
     kind = np.float32 if np.can_cast(array.dtype, np.float32, "safe") else np.float64
     return array.reshape(len(array), -1).astype(kind, copy=False) if array.ndim != 2 else array.astype(kind, copy=False)
+
+
+def is_clock(name: str) -> bool:
+    """Whether a column or array is called as times are: time, timestamps, t_ms, "stamp [ns]" …"""
+    return _TIME.fullmatch(name) is not None
+
+
+def in_seconds(times: npt.NDArray[Any], name: str) -> npt.NDArray[np.float64]:
+    """Times in seconds, by their own type, by the unit in their name, or as ms, µs or ns since 1970 by their size."""
+    if times.dtype.kind in "mM":
+        return times.astype(f"{times.dtype.kind}8[ns]").astype(np.int64) / 1e9
+    if (match := _TIME.fullmatch(name)) and match[1]:
+        return times / _UNITS.get(match[1].lower(), 1.0)
+    largest = float(np.nanmax(np.abs(times.astype(np.float64)), initial=0.0))
+    return times / next((factor for size, factor in ((1e17, 1e9), (1e14, 1e6), (1e11, 1e3)) if largest > size), 1.0)
 
 
 @contextmanager

@@ -8,8 +8,10 @@ nobody's harm.
 
 from __future__ import annotations
 
+import json
 import os
 import stat
+import zlib
 from pathlib import Path
 
 from scroll_tactile.errors import RecordingError
@@ -21,7 +23,9 @@ __all__ = [
     "Budget",
     "on_disk",
     "read_text",
+    "require_bounded",
     "require_file",
+    "require_inflated",
     "require_inside",
     "stored_bytes",
 ]
@@ -34,6 +38,9 @@ SPARE_STEPS, STEPS_A_BYTE = 1 << 19, 16
 
 LARGEST = 1 << 30
 """The largest chunk or reading, in bytes, that is believed; what claims to be larger is damaged."""
+
+_PIECE = 1 << 14  # bytes, of which deflate makes 17 million at most
+_POINTER, _LONGEST_POINTER = b"version https://git-lfs.github.com/spec/", 1024
 
 
 class Budget:
@@ -82,6 +89,31 @@ class Budget:
         )
 
 
+def require_bounded(claimed: int, stored: int, what: str) -> None:
+    """Raises RecordingError where `stored` bytes of a file claim to become more than files of their size can.
+
+    It is asked wherever a buffer is made for what a file says of itself.
+    """
+    if claimed > SPARE + RATIO * stored:
+        raise RecordingError(
+            f"{what} claims to hold {claimed} bytes in {stored} bytes on the disk; expected at most {RATIO} times as "
+            f"many, and {SPARE >> 20} MiB. It may be damaged or made to harm. If it is neither, write it with less "
+            "compression, or in parts"
+        )
+
+
+def require_inflated(data: bytes, most: int, what: str) -> None:
+    """Raises RecordingError where zlib or gzip make more than `most` bytes of `data`; a few are believed unseen."""
+    inflating, count = zlib.decompressobj(47), 0
+    for begin in range(0, len(data), _PIECE) if len(data) > SPARE >> 10 else ():
+        count += len(inflating.decompress(data[begin : begin + _PIECE]))
+        if inflating.eof:  # gzip may have several parts
+            rest, inflating = inflating.unused_data, zlib.decompressobj(47)
+            count += len(inflating.decompress(rest))
+        if count > most:
+            raise RecordingError(f"{what} becomes more than the {most} bytes that it claims, and may be made to harm")
+
+
 def stored_bytes(path: Path) -> int:
     """The bytes that a file has on the disk, holes left out; raises RecordingError for what is no file."""
     return on_disk(require_file(path))
@@ -93,12 +125,21 @@ def on_disk(about: os.stat_result) -> int:
 
 
 def require_file(path: Path) -> os.stat_result:
-    """Raises RecordingError for what is no file: opening a FIFO or a device waits for ever, or changes something."""
+    """Raises RecordingError for what is no file: opening a FIFO or a device waits for ever, or changes something.
+
+    And for a pointer of Git LFS, which stands in a file's place in a clone that was made without it.
+    """
     about = path.stat()
     if not stat.S_ISREG(about.st_mode):
         kinds = {"FIFO": stat.S_ISFIFO, "socket": stat.S_ISSOCK, "folder": stat.S_ISDIR}
         kind = next((kind for kind, of in kinds.items() if of(about.st_mode)), "device")
         raise RecordingError(f"{path} is a {kind}; expected a file. It was passed over")
+    if about.st_size < _LONGEST_POINTER:
+        with path.open("rb") as file:
+            if file.read(len(_POINTER)) == _POINTER:
+                raise RecordingError(
+                    f"{path} is a pointer of Git LFS, and the file itself was not fetched: run git lfs pull where it is"
+                )
     return about
 
 
@@ -116,4 +157,4 @@ def read_text(folder: Path, path: Path, most: int) -> str:
         data = file.read(most + 1)
     if len(data) > most:
         raise RecordingError(f"{path} has more than {most} bytes; expected less of what describes a recording")
-    return data.decode()
+    return data.decode(json.detect_encoding(data))

@@ -1,210 +1,210 @@
-"""The bytes of ROS's messages as objects, by the definitions that come with them, or else ROS 2's own."""
+"""The bytes of ROS's messages as objects, by definitions: those given, a bag's, a known driver's, or ROS 2's own."""
 
 from __future__ import annotations
 
 import functools
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from scroll_tactile.errors import RecordingError
-from scroll_tactile.libraries import missing
+from scroll_tactile.errors import InputError, RecordingError
+from scroll_tactile.libraries import optional
+from scroll_tactile.recordings import presets
 from scroll_tactile.recordings.bagfiles import Channel
-from scroll_tactile.recordings.blocks import Request
-from scroll_tactile.recordings.bounds import Budget
-from scroll_tactile.recordings.paths import fields_of
 
-__all__ = ["MessageTypes"]
+__all__ = ["MessageTypes", "definitions_of"]
 
 # rclpy's serialize_message reckons with padding behind the count of an empty list, writes none, and leaves as many
 # bytes of whatever was there behind the message: a JointState without velocities and efforts has eight. rosbags
 # takes more than three for damage.
-_END, _WIDEST = 3, 8
+_A_WORD, _MOST_REST = 4, 16
 
-# rosbags writes code for each element of an array of fixed length: a second for 4096 of them, or for 2500 fields. The
-# largest definitions of ROS's own packages, MoveIt's, have some 400 fields in all.
-_MOST_LINES, _MOST_OBJECTS = 4000, 1 << 14
-_A_LINE, _A_MESSAGE, _NESTED = 500, 8, 32  # steps of work; a nested message takes one for as many bytes
+# rosbags writes code for each element of an array of messages, and takes a second for a definition of 100 KB, as
+# MoveIt's are.
+_MOST_LETTERS, _MOST_OBJECTS = 1 << 19, 1 << 14
+
+_NOTHING = "structure_needs_at_least_one_member"  # what ROS 2 writes for a message without fields
+
+_Definitions = tuple[tuple[str, str], ...]  # a type's name, with its package or without, and the text of its .msg
+
+
+def definitions_of(given: Mapping[str, str] | str | PathLike[str] | None) -> dict[str, str]:
+    """The texts of .msg files by their types' names, of a mapping or of a folder: `package/msg/Name.msg`, or flat.
+
+    Raises InputError for a folder that has none.
+    """
+    if given is None or isinstance(given, Mapping):
+        return dict(given or {})
+    files = sorted(Path(given).rglob("*.msg"))
+    if not files:
+        raise InputError(f"expected a folder with .msg files in it; came {given}", argument="definitions")
+    packages = [file.resolve().parent.parent.name if file.resolve().parent.name == "msg" else "" for file in files]
+    names = [
+        f"{package}/msg/{file.stem}" if package else file.stem for package, file in zip(packages, files, strict=True)
+    ]
+    return {name: file.read_text(errors="replace") for name, file in zip(names, files, strict=True)}
 
 
 class MessageTypes:
-    """Turns the bytes of messages into objects, by the definitions that come with them, or else ROS 2's own."""
+    """Turns the bytes of messages into objects. given: definitions, as `definitions_of` gives them."""
 
-    def __init__(self, request: Request) -> None:
-        self.given = request.definitions
-        self.readers: dict[Channel, _MessageReader] = {}
+    def __init__(self, given: Mapping[str, str]) -> None:
+        self.given = tuple(given.items())
+        self.readers: dict[Channel, Callable[[bytes], object]] = {}
 
-    def decode(self, channel: Channel, data: bytes, budget: Budget) -> object:
-        """Raises RecordingError for a type that is not defined, bytes that do not fit it, or a budget that is spent."""
+    def decode(self, channel: Channel, data: bytes) -> Any:
+        """Raises RecordingError for a type that is not defined, and for bytes that do not fit it."""
         reader = self.readers.get(channel)
-        if reader is None:
-            given = self.given.get(channel.type, "")
-            budget.work(len(given or channel.definition) // _NESTED)
-            budget.work(_A_LINE * _lines(channel, given))
-            reader = self.readers[channel] = _reader(channel, given)
-        budget.work(reader.steps + len(data) // _NESTED if reader.nested else reader.steps)
-        try:
-            return reader.read(data)
-        except Exception as error:
-            raise RecordingError(
-                f"a message of topic {channel.topic!r} does not fit its type {channel.type}, and may be damaged: "
-                f"{type(error).__name__}: {error}"
-            ) from error
+        why: Exception | None = None
+        for read in [reader] if reader else _readers(channel, self.given):
+            try:
+                found = read(data)
+            except Exception as error:  # whatever damage does
+                why = error
+                continue
+            self.readers[channel] = read
+            return found
+        raise RecordingError(
+            f"a message of topic {channel.topic!r} does not fit its type {channel.type}, and may be damaged: "
+            f"{type(why).__name__}: {why}" + ("" if reader or channel.definition else f". {_cure(channel.type)}"),
+            argument="definitions",
+        ) from why
 
 
-@dataclass(frozen=True)
-class _MessageReader:
-    """What makes an object of bytes. steps: of work for each; nested: whether more come with its bytes."""
-
-    read: Callable[[bytes], object]
-    steps: int = _A_MESSAGE
-    nested: bool = True
-
-
-def _lines(channel: Channel, given: str) -> int:
-    """How many lines of a definition define something; raises RecordingError where they are too many."""
-    if channel.idl and not given:
-        count = _weight(channel.definition)
-    else:
-        lines = re.split(r"[\n;]", given or channel.definition)
-        count = sum(1 for line in lines if line.strip() and not line.lstrip().startswith("#"))
-    if count > _MOST_LINES:
-        raise RecordingError(f"a definition of a message has {count} lines; expected at most {_MOST_LINES}")
-    return count
+def _cure(kind: str) -> str:
+    return f"Give definitions='FOLDER', a folder with {kind.rpartition('/')[2]}.msg of its driver and what that names"
 
 
 @functools.lru_cache(256)  # as many bags as touches have the same messages
-def _reader(channel: Channel, given: str) -> _MessageReader:
+def _readers(channel: Channel, given: _Definitions) -> tuple[Callable[[bytes], object], ...]:
+    """What may make objects of a channel's bytes: several where versions of a driver differ."""
     if channel.encoding == "json":
-        return _MessageReader(json.loads)
+        return (json.loads,)
     if channel.encoding not in ("cdr", "ros1"):
         raise RecordingError(
             f"messages of topic {channel.topic!r} are encoded as {channel.encoding!r}; expected cdr, ros1 or json"
         )
-    try:
-        from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
-    except ImportError as error:
-        raise missing("rosbags", "ros", "a ROS recording", cause=error) from error
-    store = get_typestore(Stores.EMPTY)
-    text = given or channel.definition
-    try:
-        if text and channel.idl and not given:
-            for part in _parts(text):
-                store.register(get_types_from_idl(part))
-        elif text:
-            store.register(get_types_from_msg(text, channel.type))
-    except Exception as error:
-        raise RecordingError(f"the definition of {channel.type} cannot be read: {error}") from error
-    if not text or channel.type not in store.fielddefs:
-        store = get_typestore(Stores.LATEST)
-    if channel.type not in store.fielddefs:
-        raise RecordingError(
-            f"{channel.type} of topic {channel.topic!r} is not defined in the recording, as before ROS 2 Iron: "
-            f"pass definitions={{{channel.type!r}: text of its .msg file}}",
-            argument="definitions",
-        )
-    objects, nested = _objects(store.fielddefs, channel.type, {})
-    if objects > _MOST_OBJECTS:
-        raise RecordingError(f"a message of {channel.type} holds {objects} values; expected at most {_MOST_OBJECTS}")
-    if channel.encoding == "ros1":
-        return _MessageReader(lambda data: store.deserialize_ros1(data, channel.type), _A_MESSAGE + objects, nested)
-    return _MessageReader(functools.partial(_read_cdr, store, channel.type), _A_MESSAGE + objects, nested)
+    with optional("rosbags", "ros", "a ROS recording"):
+        from rosbags.typesys import Stores, get_typestore
+    readers: list[Callable[[bytes], object]] = []
+    for texts in _alternatives(channel, given):
+        store = get_typestore(Stores.EMPTY)
+        try:
+            store.register(_needed(channel, texts))
+        except InputError:
+            raise
+        except Exception as error:
+            raise RecordingError(
+                f"the definition of {channel.type} cannot be read: {error}. {_cure(channel.type)}",
+                argument="definitions",
+            ) from error
+        readers.append(functools.partial(_read_ros1 if channel.encoding == "ros1" else _read_cdr, store, channel.type))
+    return tuple(readers)
 
 
-def _objects(definitions: Any, name: str, known: dict[str, tuple[int, bool] | None]) -> tuple[int, bool]:
-    """How many objects each message of a type becomes, arrays of numbers one each; whether it has lists of others.
+def _read_ros1(store: Any, kind: str, data: bytes) -> object:
+    return store.deserialize_ros1(data, kind)
 
-    known: those of other types; None while it is being found out. Raises RecordingError for a type that holds itself,
-    or nothing.
+
+def _alternatives(channel: Channel, given: _Definitions) -> Iterator[dict[str, str]]:
+    """The texts that may define a channel's type, by full names; none where the bag defines it itself."""
+    package, _, short = channel.type.rpartition("/")
+    if channel.definition and not {channel.type, short} & {name for name, _ in given}:
+        yield {}
+        return
+    for driver in presets.definitions(short) or [{}]:
+        texts = {f"{package}/{name.rpartition('/')[2]}": text for name, text in [*driver.items(), *given]}
+        yield texts | {name: text for name, text in given if "/" in name}
+
+
+def _needed(channel: Channel, texts: Mapping[str, str]) -> dict[str, Any]:
+    """The definitions of a channel's type and of all that it is made of, as rosbags has them.
+
+    Raises RecordingError for one that is not there, that holds itself or nothing, or that is too large.
     """
     from rosbags.interfaces import Nodetype
+    from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
-    if name in known:
-        if (found := known[name]) is None:
+    known: dict[str, Any] = {}
+    if not texts and channel.definition:
+        if len(channel.definition) > _MOST_LETTERS:
+            raise RecordingError(f"the definition of {channel.type} has more than {_MOST_LETTERS} letters")
+        if channel.idl:
+            for part in _plain(channel.definition):
+                known |= get_types_from_idl(part)
+        else:
+            known = get_types_from_msg(channel.definition, channel.type)
+    of_ros = get_typestore(Stores.ROS2_HUMBLE).fielddefs
+    needed: dict[str, Any] = {}
+    sizes: dict[str, int] = {}
+
+    def size(name: str) -> int:
+        """How many objects each message of a type becomes, arrays of numbers one each."""
+        if name in sizes:
+            return sizes[name]
+        if name in needed:
             raise RecordingError(f"a message of {name} holds itself")
-        return found
-    known[name] = None
-    total, nested = 1, False
-    for field, (kind, about) in definitions[name][1]:
-        array, several = kind == Nodetype.ARRAY, kind == Nodetype.SEQUENCE
-        of, what = about[0] if array or several else (kind, about)
-        plain = of == Nodetype.BASE and what[0] != "string"
-        inside, deeper = _objects(definitions, what, known) if of == Nodetype.NAME else (1, False)
-        names = [name for name, _ in definitions[what][1]] if of == Nodetype.NAME else [field]
-        if (array and about[1] < 1) or names in ([], ["structure_needs_at_least_one_member"]):
-            # There could be any number of them in no byte.
-            raise RecordingError(f"field {field!r} of {name} can hold nothing; expected numbers or texts in it")
-        total += inside * (about[1] if array and not plain else 1)
-        nested |= deeper or (several and not plain)
-    known[name] = total, nested
-    return total, nested
+        if name not in known and name in texts:
+            known.update(get_types_from_msg(texts[name], name))
+        if (about := known.get(name, of_ros.get(name))) is None:
+            raise RecordingError(
+                f"{name} of topic {channel.topic!r} is not defined in the recording, as before ROS 2 Iron. "
+                f"{_cure(name)}",
+                argument="definitions",
+            )
+        needed[name] = about
+        total = 1
+        for field, (form, what) in about[1]:
+            several = form in (Nodetype.ARRAY, Nodetype.SEQUENCE)
+            part, inner = what[0] if several else (form, what)
+            count = what[1] if form == Nodetype.ARRAY else 1
+            objects = size(inner) if part == Nodetype.NAME else 1
+            nothing = part == Nodetype.NAME and {name for name, _ in needed[inner][1]} <= {_NOTHING}
+            if several and (count < 1 or nothing):  # there could be any number of them in no byte
+                raise RecordingError(f"field {field!r} of {name} can hold nothing; expected numbers or texts in it")
+            total += objects * (count if part == Nodetype.NAME or inner[0] == "string" else 1)
+        if total > _MOST_OBJECTS:
+            raise RecordingError(f"a message of {name} holds {total} values; expected at most {_MOST_OBJECTS}")
+        sizes[name] = total
+        return total
+
+    size(channel.type)
+    return needed
 
 
 def _read_cdr(store: Any, kind: str, data: bytes) -> object:
     try:
         return store.deserialize_cdr(data, kind)
     except Exception:
-        about = store.get_msgdef(kind)
-        with suppress(Exception):  # whatever damage does; the first error says it
-            read = {b"\0\0": about.deserialize_cdr_be, b"\0\1": about.deserialize_cdr_le}[data[:2]]
-            message, end = read(data[4:], 0, about.cls, store)
-            if len(data) - 4 - end <= _END + _WIDEST * _empty_lists(message):
-                return message
+        for rest in range(_A_WORD, _MOST_REST + 1, _A_WORD):
+            with suppress(Exception):  # whatever damage does; the first error says it
+                return store.deserialize_cdr(data[:-rest], kind)
         raise
 
 
-def _empty_lists(message: Any) -> int:
-    """How many lists of 8-byte numbers in a message are empty."""
-    if isinstance(message, np.ndarray):
-        return int(message.size == 0 and message.itemsize == _WIDEST)
-    if isinstance(message, list):
-        return sum(map(_empty_lists, message))
-    return sum(_empty_lists(getattr(message, name)) for name in fields_of(message))
-
-
-# Definitions in IDL are made plain for rosbags' parser, which is slow by more than their length. It tries what stands
-# in a parenthesis eighty times, and in two within each other 6400 times; it tries a sequence twice, and one within
-# three others 16 times; it goes through a constant's text 64 times; and it works out whatever numbers a definition has
-# it make. What ROS 2 makes of a .msg has parentheses and shifts in annotations and comments alone.
-_SEPARATOR, _HEADER = "=" * 80 + "\n", re.compile(r"\AIDL: .*\n")
+# What rosbags' parser of IDL takes long for: it tries what stands in parentheses eighty times, a sequence in sequences
+# as often as two to their number, and it works out whatever numbers a definition has it make. What ROS 2 makes of a
+# .msg has those in comments, annotations and texts alone.
 _TOKEN = re.compile(r'("[^"\\]*(?:\\"?[^"\\]*)*")|/\*.*?(?:\*/|\Z)|//[^\n]*', re.DOTALL)  # a text, or else a comment
 _ANNOTATION = re.compile(r"@\s*[A-Za-z:][\w:]*(?:\s*\([^()]*\))?")
 _REFUSED = re.compile(r"\(|<<|\*|\bsequence ?< ?sequence ?<")
-_EXPRESSION, _PIECE = re.compile(r'[=\[,|^&+\-/%~"]|\bw?string ?<|>>'), re.compile(r"[;{]|::")
-_AN_EXPRESSION = 8  # pieces that take as long
 
 
-@functools.lru_cache(16)  # they are weighed, and then read
-def _parts(text: str) -> tuple[str, ...]:
-    """The definitions in a text, without comments and annotations, and with nothing in the texts of constants.
-
-    One that needs others holds them all, each below a line of = and one with its name. Raises RecordingError for what
-    the parser cannot read in the time that its length allows.
-    """
-    return tuple(_plain(_HEADER.sub("", part)) for part in text.split(_SEPARATOR) if part)
-
-
-def _weight(text: str) -> int:
-    """How many members a definition has, or as much else as takes the parser as long; raises RecordingError as above.
-
-    An array's length, a constant and each operator take as long as eight.
-    """
-    return sum(_AN_EXPRESSION * len(_EXPRESSION.findall(part)) + len(_PIECE.findall(part)) for part in _parts(text))
-
-
-def _plain(text: str) -> str:
-    plain = _TOKEN.sub(lambda found: " " if found[1] is None else '""', text)
-    plain = re.sub(r"\s+", " ", _ANNOTATION.sub(" ", plain))
-    if found := _REFUSED.search(plain):
-        raise RecordingError(
-            f"a definition in IDL has {found[0]!r} in {plain[max(found.start() - 30, 0) : found.end() + 30]!r}; "
-            "expected constants and lengths as plain numbers, and no sequence in a sequence, as ROS 2 writes. Pass "
-            "the type's .msg file in definitions=, or write the numbers out",
-            argument="definitions",
-        )
-    return plain
+def _plain(definition: str) -> Iterator[str]:
+    """The parts of a definition in IDL without comments, annotations, texts; raises RecordingError for the above."""
+    for part in re.split(r"^=+\n", definition, flags=re.MULTILINE):
+        plain = _TOKEN.sub(lambda found: " " if found[1] is None else '""', re.sub(r"\AIDL: .*\n", "", part))
+        plain = re.sub(r"\s+", " ", _ANNOTATION.sub(" ", plain))
+        if found := _REFUSED.search(plain):
+            raise RecordingError(
+                f"a definition in IDL has {found[0]!r} in {plain[max(found.start() - 30, 0) : found.end() + 30]!r}; "
+                "expected plain numbers, and no sequence in a sequence, as ROS 2 writes: give definitions='FOLDER' "
+                "with the type's .msg file",
+                argument="definitions",
+            )
+        if plain.strip():
+            yield plain

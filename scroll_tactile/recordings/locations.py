@@ -6,15 +6,13 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Any
 
 from scroll_tactile.errors import RecordingError
 from scroll_tactile.libraries import missing
 
 __all__ = ["file_system", "is_remote", "local"]
-
-_DEEPEST = 16  # folders within each other
 
 
 def is_remote(address: str) -> bool:
@@ -50,12 +48,10 @@ def file_system(address: str) -> tuple[Any, str]:
         import fsspec
 
         found: tuple[Any, str] = fsspec.core.url_to_fs(address)
-    except ImportError as error:
-        s3 = address.partition("://")[0] in ("s3", "s3a")
-        if s3 or error.name == "fsspec":
-            raise missing("s3fs" if s3 else "fsspec", "s3", address) from error
-        raise RecordingError(f"{address} cannot be reached: {error}") from error
     except Exception as error:  # each file system has errors of its own
+        s3 = address.partition("://")[0] in ("s3", "s3a")
+        if isinstance(error, ImportError) and (s3 or error.name == "fsspec"):
+            raise missing("s3fs" if s3 else "fsspec", "s3", address) from error
         raise RecordingError(f"{address} cannot be reached: {type(error).__name__}: {error}") from error
     return found
 
@@ -63,15 +59,21 @@ def file_system(address: str) -> tuple[Any, str]:
 def _copied(address: str, folder: Path) -> Path:
     files, path = file_system(address)
     root = path.rstrip("/")
-    target = folder / _named(root.rpartition("/")[2] or "recording", address)
+    target = folder / (root.rpartition("/")[2] or "recording")
     try:
-        if files.isdir(path):
-            return _copied_folder(files, root, target, address)
-        about = files.info(path)
-        if about.get("type", "file") != "file":
-            raise RecordingError(f"{address} is of type {about['type']!r:.40}; expected a file or a folder")
-        _require_room(about.get("size") or 0, folder, address)
-        files.get_file(path, str(target))
+        about = {root: files.info(path)} if not files.isdir(path) else files.find(root, maxdepth=16, detail=True)
+        if any(entry.get("type", "file") != "file" for entry in about.values()):
+            raise RecordingError(f"{address} is of type {about[root]['type']!r:.40}; expected a file or a folder")
+        places = {name: target.joinpath(*_inside(name, root, address)) for name in about if not name.endswith("/")}
+        size, free = sum(entry.get("size") or 0 for entry in about.values()), shutil.disk_usage(folder).free
+        if size > free:
+            raise RecordingError(
+                f"{address} holds {size} bytes, and {free} are free where it would be copied to, {folder.parent}: set "
+                "TMPDIR to a folder with more room, or fetch it in parts"
+            )
+        for place in places.values():
+            place.parent.mkdir(parents=True, exist_ok=True)
+        files.get(list(places), [str(place) for place in places.values()])  # many at once, where it can
     except RecordingError:
         raise
     except FileNotFoundError as error:
@@ -81,36 +83,12 @@ def _copied(address: str, folder: Path) -> Path:
     return target
 
 
-def _copied_folder(files: Any, root: str, target: Path, address: str) -> Path:
-    """The files of a folder below `target`. Whoever may write there names them: no name of theirs leads out of it."""
-    there = files.find(root, maxdepth=_DEEPEST, detail=True)
-    places: dict[str, Path] = {}
-    for name in there:
-        inside = str(name).removeprefix(f"{root}/")
-        if inside == name:
-            raise RecordingError(f"{address} lists {name!r:.200}, which does not lie in it")
-        if inside and not inside.endswith("/"):  # as some programs mark a folder
-            places[name] = target.joinpath(*(_named(part, address) for part in inside.split("/")))
-    _require_room(sum(there[name].get("size") or 0 for name in places), target.parent, address)
-    for place in places.values():
-        place.parent.mkdir(parents=True, exist_ok=True)
-    files.get(list(places), [str(place) for place in places.values()])  # many at once, where it can
-    return target
-
-
-def _named(part: str, address: str) -> str:
-    """A part of a name as it may stand in a path; raises RecordingError for one that leads elsewhere."""
-    if part in ("", ".", "..") or "\\" in part or "\0" in part or PurePath(part).name != part:
-        raise RecordingError(
-            f"{address} names a file by {part!r:.100}, which leads out of its folder: it was not fetched"
-        )
-    return part
-
-
-def _require_room(size: int, folder: Path, address: str) -> None:
-    free = shutil.disk_usage(folder).free
-    if size > free:
-        raise RecordingError(
-            f"{address} holds {size} bytes, and {free} are free where it would be copied to, {folder.parent}: set "
-            "TMPDIR to a folder with more room, or fetch it in parts"
-        )
+def _inside(name: str, root: str, address: str) -> list[str]:
+    """The parts of a file's name below a folder. Whoever may write there names it: no name leads out of the folder."""
+    parts = name.removeprefix(root).strip("/").split("/") if name != root else []
+    for part in parts:
+        if not name.startswith(root) or part in ("", ".", "..") or "\\" in part or "\0" in part:
+            raise RecordingError(
+                f"{address} names a file by {part!r:.100}, which leads out of its folder: it was not fetched"
+            )
+    return parts

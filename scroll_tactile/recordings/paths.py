@@ -13,6 +13,7 @@ import array
 import difflib
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial
 from typing import Any, NoReturn
 
 import numpy as np
@@ -25,11 +26,11 @@ __all__ = ["CLOCK_KEYS", "FieldPath", "fields_of", "matched", "nearest", "select
 CLOCK_KEYS = ("timestamp", "timestamps", "time", "times")
 """What an array of times is called, seconds."""
 
-_Collect = Callable[[Any, list[Any]], None]
-_Step = str | int | slice | list["list[_Step]"]
-_TOKEN = re.compile(r"\s*([A-Za-z_]\w*|-?\d+|[.{},*:\[\]])\s*")
+_Step = Callable[[list[Any]], list[Any]]
+_NAME, _SPACE = re.compile(r"[A-Za-z_]\w*"), re.compile(r"\s*")
+_INDEX = re.compile(r"\[\s*(?:(\*)|(-?\d{1,9})|(-?\d{1,9})?\s*:\s*(-?\d{1,9})?)\s*\]")
 _ARRAYS = (list, tuple, np.ndarray, array.array)  # rclpy has the last
-_DEEPEST = 32  # no message is nested as deep; a path of a million brackets is no path
+_DEEPEST = 32  # no message is nested as deep; a path of a million braces is no path
 
 
 class FieldPath:
@@ -40,35 +41,36 @@ class FieldPath:
 
     def __init__(self, text: str) -> None:
         self.text = text.strip()
-        self._collect = _compiled(_Parser(self.text).steps(0))
+        self._steps, _ = _compiled(self.text)
 
     def values(self, message: object) -> list[Any]:
-        """What the path leads to, in order: numbers, arrays, texts, or messages.
+        """What the path leads to, in order: numbers, arrays, texts, or messages. An empty array leads to nothing.
 
         Raises FieldError for a field that a message does not have, naming those nearest, or an element beyond the end.
         """
-        found: list[Any] = []
+        found = [message]
         try:
-            self._collect(message, found)
+            for step in self._steps:
+                found = step(found)
+            return found
         except FieldError as error:
             raise FieldError(f"field {self.text!r}: {error}") from None
-        return found
 
     def reading(self, message: object) -> npt.NDArray[Any]:
-        """The numbers that the path leads to, flat: one reading, shape (n,).
+        """The numbers that the path leads to, flat: one reading, shape (n,), of n = 0 where its array is empty.
 
         Raises FieldError for a field that is not there, or one that holds text or whole messages.
         """
         found = self.values(message)
         if len(found) == 1:
             return self._numbers(found[0])
-        if found and type(found[0]) in (float, int) and all(type(value) in (float, int) for value in found):
-            return self._numbers(found)
-        return np.concatenate([self._numbers(value) for value in found]) if found else np.empty(0)
+        if set(map(type, found)) <= {float, int}:
+            return np.asarray(found)
+        return np.concatenate([self._numbers(value) for value in found])
 
     def _numbers(self, value: Any) -> npt.NDArray[Any]:
         if not isinstance(value, np.ndarray):
-            if isinstance(value, str) or _messages(value):
+            if isinstance(value, str) or fields_of(_first(value)):
                 self._refuse(value)
             try:
                 value = np.asarray(value)
@@ -80,17 +82,20 @@ class FieldPath:
         return flat
 
     def _refuse(self, value: Any) -> NoReturn:
-        message = value[0] if isinstance(value, Sequence) and not isinstance(value, str) and len(value) else value
-        names = fields_of(message)
-        if names:
-            inside = ", ".join(names)
+        message = _first(value)
+        if names := fields_of(message):
             deeper = f"{self.text}[*]" if message is not value else self.text
             raise FieldError(
-                f"field {self.text!r} leads to a message, not to numbers; inside it are {inside}: "
+                f"field {self.text!r} leads to a message, not to numbers; inside it are {', '.join(names)}: "
                 f"write {deeper}.{names[-1]!s} or {deeper}.{{{','.join(names[-3:])}}}"
             )
         kind = "text" if isinstance(message, str | bytes | np.str_) else f"a {type(message).__name__}"
         raise FieldError(f"field {self.text!r} leads to {kind}, {str(value)!r:.40}; expected numbers")
+
+
+def _first(value: Any) -> Any:
+    """The first element of a list; anything else itself."""
+    return value[0] if isinstance(value, list | tuple) and value else value
 
 
 def matched(field: str, keys: Collection[str], source: str) -> tuple[str, str]:
@@ -120,10 +125,9 @@ def select(array: npt.NDArray[Any], rest: str, text: str) -> npt.NDArray[Any]:
     """
     if not rest:
         return array
-    steps = _Parser(rest).steps(0)
-    if len(steps) != 1 or isinstance(steps[0], str | list):
+    if not (found := _INDEX.fullmatch(rest.strip())):
         raise FieldError(f"field {text!r}: expected one index such as [0:19] after the name; came {rest!r}")
-    step = steps[0]
+    step = _index(found)
     try:
         return array[:, [step]] if isinstance(step, int) else array[:, step]
     except IndexError as error:
@@ -151,174 +155,114 @@ def nearest(name: str, names: Sequence[str]) -> str:
     return f"; there are {listed}" if found is None else f"; nearest is {found!r} (of {listed})"
 
 
-class _Parser:
-    """Turns a path's text into steps: a name, an index, a slice (`[*]` is the whole), or a list of paths (`{…}`)."""
-
-    def __init__(self, text: str) -> None:
-        self.text = text
-        self.tokens: list[tuple[str, int]] = []
-        i = 0
-        while i < len(text):
-            match = _TOKEN.match(text, i)
-            if match is None:
-                self._fail("a name, a dot, brackets or braces", i)
-            self.tokens.append((match.group(1), match.start(1)))
-            i = match.end()
-        self.i = 0
-
-    def steps(self, depth: int) -> list[_Step]:
-        if depth > _DEEPEST:
-            self._fail(f"at most {_DEEPEST} braces within each other", self._where())
-        steps: list[_Step] = []
-        while True:
-            token = self._peek()
-            if token == "[":
-                steps.append(self._index())
-            elif token == "{" and (not steps or self._before() == "."):
-                steps.append(self._alternatives(depth))
-            elif token[:1].isidentifier() and (not steps or self._before() == "."):
-                steps.append(self._next())
-            elif token == "." and steps and self._before() != ".":
-                self._next()
-                continue
-            elif steps and self._before() != "." and (token == "" if depth == 0 else token in (",", "}")):
-                return steps
-            else:
-                self._fail("a field's name" if not steps or self._before() == "." else "a dot or an index")
-
-    def _alternatives(self, depth: int) -> list[list[_Step]]:
-        self._next()
-        paths = [self.steps(depth + 1)]
-        while self._next() == ",":
-            paths.append(self.steps(depth + 1))
-        return paths
-
-    def _index(self) -> int | slice:
-        self._next()
-        inside = []
-        while self._peek() not in ("]", ""):
-            inside.append(self._next())
-        if self._next() != "]":
-            self._fail("]")
-        text = "".join(inside)
-        if text == "*":
-            return slice(None)
-        if re.fullmatch(r"-?\d{1,9}", text):
-            return int(text)
-        match = re.fullmatch(r"(-?\d{1,9})?:(-?\d{1,9})?", text)
-        if match is None:
-            self._fail("an index: [0], [*] or [0:19]", self._where() - 1)
-        low, high = match.groups()
-        return slice(int(low) if low else None, int(high) if high else None)
-
-    def _peek(self) -> str:
-        return self.tokens[self.i][0] if self.i < len(self.tokens) else ""
-
-    def _before(self) -> str:
-        return self.tokens[self.i - 1][0] if self.i else ""
-
-    def _next(self) -> str:
-        token = self._peek()
-        self.i += 1
-        return token
-
-    def _where(self) -> int:
-        return self.tokens[self.i][1] if self.i < len(self.tokens) else len(self.text)
-
-    def _fail(self, expected: str, where: int | None = None) -> NoReturn:
-        where = self._where() if where is None else where
-        raise FieldError(
-            f"field {self.text!r:.80}: expected {expected} at character {where + 1}; came {self.text[where:][:10]!r}. "
-            "A path looks like tactiles[0].electrodes or pillars[*].{fX,fY,fZ}"
-        )
+# A path's text, compiled: each step makes of a list of values the list of what it leads to.
 
 
-def _compiled(steps: list[_Step]) -> _Collect:
-    collect: _Collect = _append
-    for step in reversed(steps):
-        if isinstance(step, str):
-            collect = _attribute(step, collect)
-        elif isinstance(step, list):
-            collect = _several([_compiled(path) for path in step], collect)
+def _compiled(text: str, i: int = 0, depth: int = 0) -> tuple[list[_Step], int]:
+    """The steps of the path that begins at letter i, and where it ends; raises FieldError for a text that is none."""
+    if depth > _DEEPEST:
+        _fail(text, i, f"at most {_DEEPEST} braces within each other")
+    steps: list[_Step] = []
+    fresh = True  # a name comes next: at the beginning, and behind a dot
+    while True:
+        i = _SPACE.match(text, i).end()  # type: ignore[union-attr]  # it always matches
+        letter = text[i : i + 1]
+        if letter == "[":
+            if (found := _INDEX.match(text, i)) is None:
+                _fail(text, i, "an index: [0], [*] or [0:19]")
+            steps.append(partial(_element, _index(found)))
+            fresh, i = False, found.end()
+        elif letter == "{" and fresh:
+            paths = []
+            while letter in ("{", ","):
+                path, i = _compiled(text, i + 1, depth + 1)
+                paths.append(path)
+                letter = text[i]
+            plain = all(isinstance(step, _Attribute) for path in paths for step in path)  # each leads to one value
+            steps.append(partial(_columns if plain else _several, paths))
+            fresh, i = False, i + 1
+        elif fresh and (found := _NAME.match(text, i)):
+            steps.append(_Attribute(found[0]))
+            fresh, i = False, found.end()
+        elif letter == "." and not fresh:
+            fresh, i = True, i + 1
+        elif not fresh and letter in ((",", "}") if depth else ("",)):
+            return steps, i
         else:
-            collect = _element(step, collect)
-    return collect
+            _fail(text, i, "a field's name" if fresh else "a dot or an index")
 
 
-def _append(value: Any, found: list[Any]) -> None:
-    found.append(value)
+def _fail(text: str, i: int, expected: str) -> NoReturn:
+    raise FieldError(
+        f"field {text!r:.80}: expected {expected} at character {i + 1}; came {text[i:][:10]!r}. "
+        "A path looks like tactiles[0].electrodes or pillars[*].{fX,fY,fZ}"
+    )
 
 
-def _attribute(name: str, rest: _Collect) -> _Collect:
-    actual: dict[type, str] = {}  # of each type of message, what it calls this field
-
-    def collect(message: Any, found: list[Any]) -> None:
-        kind = type(message)
-        key = actual.get(kind)
-        if key is None:
-            key = _actual(message, name)
-            if isinstance(message, Mapping):
-                rest(message[key], found)
-                return
-            actual[kind] = key
-        rest(getattr(message, key), found)
-
-    return collect
+def _index(found: re.Match[str]) -> int | slice:
+    every, one, low, high = found.groups()
+    return (
+        int(one) if one else slice(int(low) if low else None, int(high) if high else None) if not every else slice(None)
+    )
 
 
-def _actual(message: Any, name: str) -> str:
-    names = fields_of(message)
-    if name in names:
-        return name
-    alike = [other for other in names if other.lower() == name.lower()]
-    if len(alike) == 1:
-        return alike[0]
-    if isinstance(message, _ARRAYS):
-        raise FieldError(f"an array of {len(message)} stands before {name!r}: write [0] or [*] between them")
-    if not names:
-        raise FieldError(f"{name!r} is wanted of a {type(message).__name__}, which has no fields")
-    raise FieldError(f"the message has no {name!r}{nearest(name, names)}")
+def _through(steps: list[_Step], values: list[Any]) -> list[Any]:
+    for step in steps:
+        values = step(values)
+    return values
 
 
-def _several(paths: list[_Collect], rest: _Collect) -> _Collect:
-    def collect(message: Any, found: list[Any]) -> None:
-        for path in paths:
-            if rest is _append:
-                path(message, found)
-                continue
-            inner: list[Any] = []
-            path(message, inner)
-            for value in inner:
-                rest(value, found)
+class _Attribute:
+    """A step to a field by its name."""
 
-    return collect
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.actual: dict[type, str] = {}  # of each type of message, what it calls this field
 
-
-def _element(step: int | slice, rest: _Collect) -> _Collect:
-    def collect(message: Any, found: list[Any]) -> None:
-        if not isinstance(message, _ARRAYS):
-            raise FieldError(f"{_shown(step)} is wanted of a {type(message).__name__}, which is no array")
-        if isinstance(step, slice) and (rest is not _append or _messages(message)):
-            for value in message[step]:
-                rest(value, found)
-            return
+    def __call__(self, values: list[Any]) -> list[Any]:
         try:
-            value = message[step]
-        except IndexError:
-            raise FieldError(f"{_shown(step)} is wanted of an array of {len(message)}") from None
-        rest(value, found)
+            name = self.actual[type(values[0])]
+            return [getattr(values[0], name)] if len(values) == 1 else [getattr(value, name) for value in values]
+        except (KeyError, IndexError, AttributeError):  # of the first message, of none, and where they differ in type
+            return [self.of(value) for value in values]
 
-    return collect
+    def of(self, value: Any) -> Any:
+        """The field of one message."""
+        name, names = self.name, fields_of(value)
+        if name not in names:
+            alike = [other for other in names if other.lower() == name.lower()]
+            if len(alike) != 1:
+                if isinstance(value, _ARRAYS):
+                    raise FieldError(f"an array of {len(value)} stands before {name!r}: write [0] or [*] between them")
+                if not names:
+                    raise FieldError(f"{name!r} is wanted of a {type(value).__name__}, which has no fields")
+                raise FieldError(f"the message has no {name!r}{nearest(name, names)}")
+            name = alike[0]
+        if isinstance(value, Mapping):
+            return value[name]
+        self.actual[type(value)] = name
+        return getattr(value, name)
 
 
-def _shown(step: int | slice) -> str:
-    if isinstance(step, int):
-        return f"[{step}]"
-    return "[*]" if step == slice(None) else f"[{step.start or ''}:{step.stop or ''}]"
+def _columns(paths: list[list[_Step]], values: list[Any]) -> list[Any]:
+    return [value for row in zip(*(_through(path, values) for path in paths), strict=True) for value in row]
 
 
-def _messages(value: Any) -> bool:
-    """Whether this is a message, or a list of messages."""
-    if isinstance(value, list | tuple):
-        return bool(value) and bool(fields_of(value[0]))
-    return bool(fields_of(value))
+def _several(paths: list[list[_Step]], values: list[Any]) -> list[Any]:
+    return [found for value in values for path in paths for found in _through(path, [value])]
+
+
+def _element(step: int | slice, values: list[Any]) -> list[Any]:
+    found: list[Any] = []
+    for value in values:
+        if not isinstance(value, _ARRAYS):
+            shown = "[*]" if step == slice(None) else str(step) if isinstance(step, slice) else f"[{step}]"
+            raise FieldError(f"{shown} is wanted of a {type(value).__name__}, which is no array")
+        if isinstance(step, slice):
+            found += value[step] if isinstance(value, list | tuple) else [value[step]]
+        elif len(value):
+            try:
+                found.append(value[step])
+            except IndexError:
+                raise FieldError(f"[{step}] is wanted of an array of {len(value)}") from None
+    return found

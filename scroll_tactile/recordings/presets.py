@@ -8,6 +8,7 @@ sensor sends in use, a `Sensor` of one's own with the range seen resolves more.
 
 from __future__ import annotations
 
+import re
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -15,7 +16,7 @@ from scroll_tactile.errors import FieldError, InputError
 from scroll_tactile.recordings.paths import FieldPath, nearest
 from scroll_tactile.sensors import CONTACTILE, Sensor
 
-__all__ = ["PRESETS", "Preset", "fields_for", "find", "is_known", "names_for"]
+__all__ = ["PRESETS", "Preset", "definitions", "fields_for", "find", "is_known", "names_for"]
 
 
 @dataclass(frozen=True)
@@ -79,6 +80,31 @@ PRESETS = {
 # Further fields of known messages that are worth listing first.
 _ALSO = {"tactilestate": ("sensors[*].values",), "float32multiarray": ("data",), "float64multiarray": ("data",)}
 
+# What is in drivers' messages, for bags that do not define them, as before ROS 2 Iron: by the name of what is sent,
+# that and its parts. What stands in parentheses is in some versions of a driver alone.
+_MESSAGES = {
+    "BiotacAll": "BiotacAll: std_msgs/Header header; Biotac[5] tactiles | Biotac: int16 pac0; int16 pac1; "
+    "(int16[] pac;) int16 pdc; int16 tac; int16 tdc; int16[] electrodes",
+    "SensStream": "SensStream: SensorFull[] sensors | SensorFull: uint32 message; float64 time; string model; "
+    "uint8 sensor_pos; Taxel[] taxels; Forces[] forces | Taxel: uint16 x; uint16 y; uint16 z | "
+    "Forces: float32 x; float32 y; float32 z",
+    "SensorState": "SensorState: std_msgs/Header header; int64 tus; PillarState[] pillars; float32 gfx; float32 gfy; "
+    "float32 gfz; float32 gtx; float32 gty; float32 gtz (; float32 friction_est; float32 target_grip_force; "
+    "bool is_sd_active; bool is_ref_loaded) (; bool is_contact) | PillarState: (std_msgs/Header header;) int32 id; "
+    "float32 dx; float32 dy; float32 dz; float32 fx; float32 fy; float32 fz; bool in_contact; int32 slip_state",
+    "StaticData": "StaticData: Taxels[2] taxels | Taxels: uint16[28] values",
+    "TactileState": "TactileState: std_msgs/Header header; sensor_msgs/ChannelFloat32[] sensors",
+}
+
+
+def definitions(kind: str) -> list[dict[str, str]]:
+    """The .msg texts of a known driver's message and its parts, by name; one for each version, none where none is."""
+    versions = [_MESSAGES[kind]] if kind in _MESSAGES else []
+    while versions and "(" in versions[0]:
+        versions = [re.sub(r"\((.*?)\)", kept, text, count=1) for text in versions for kept in (r"\1", "")]
+    pairs = [[part.partition(":")[::2] for part in text.split("|")] for text in versions]
+    return [{name.strip(): text.replace(";", "\n").strip() for name, text in version} for version in pairs]
+
 
 def find(name: str) -> Preset:
     """The preset of this name; raises InputError, with the nearest, for one that is not there."""
@@ -108,7 +134,7 @@ def fields_for(kind: str, message: object) -> list[tuple[str, tuple[int, ...]]]:
     for text in (*texts, *_ALSO.get(_short(kind), ())):
         with suppress(FieldError):
             found[text] = FieldPath(text).reading(message).shape
-    return list(found.items())
+    return [(text, shape) for text, shape in found.items() if shape != (0,)]
 
 
 def _short(kind: str) -> str:

@@ -16,6 +16,7 @@ from scroll_tactile.errors import ChannelCountError, InputError, RecordingError
 from scroll_tactile.recordings import presets
 from scroll_tactile.recordings.blocks import Block, Contents, Request, Source, guarded
 from scroll_tactile.recordings.bounds import require_file
+from scroll_tactile.recordings.decoding import definitions_of
 from scroll_tactile.recordings.locations import local
 from scroll_tactile.recordings.recording import Episode, Gap, Recording, Report, longest_step, only_columns, resampled
 
@@ -30,6 +31,7 @@ _FAST, _BATCH, _LATE = (
 # latest twentieth of all steps are so many times as long: the pauses between batches are no gaps
 
 _Address = str | PathLike[str]
+_Definitions = Mapping[str, str] | str | PathLike[str] | None
 _Times = npt.NDArray[np.float64]
 
 
@@ -48,27 +50,30 @@ def read(
     header: bool | None = None,
     delimiter: str | None = None,
     decimal: str = ".",
-    definitions: Mapping[str, str] | None = None,
+    definitions: _Definitions = None,
 ) -> Recording:
     """All readings of a file, or of a folder that is one recording.
 
-    path: a ROS 1 `.bag`; a ROS 2 `.db3` or `.mcap`, or the folder of a bag; a LeRobotDataset v3; robomimic's HDF5; a
-        Zarr replay buffer; `.npy`; `.csv`. Bags in a folder whose names differ in a last number alone are one that was
+    path: a ROS 1 `.bag`; a ROS 2 `.db3` or `.mcap`, or the folder of a bag; a LeRobotDataset v2 or v3; `.parquet`
+        and `.feather`; HDF5, as robomimic's; a Zarr replay buffer; `.npy`, `.npz` and `.mat`; `.csv`. Bags in a folder whose names differ in a last number alone are one that was
         split. On this machine, or an address that fsspec knows.
     topic, field: where the numbers are. Of messages `field` is a path such as `tactiles[0].electrodes`, see `paths`; of
-        tables it names columns (`e1:e19`, `e*`, `a,b`), of others an array, with an index behind it (`[0:19]`).
+        tables it names columns (`e1:e19`, `e*`, `a,b`), of others an array, with an index behind it (`[0:19]`); arrays
+        that a pattern finds in several groups (`run/*/tactile`), and entries of a stack (`x[*]`), are episodes, see
+        `arraystores`.
     clock: "device", "header", "publish" or "log"; or a field, column or array with times. Without it the first of these
         that runs; see `Report`.
     columns: those of the readings that are taken, by their places from 0, such as "25:44" or "0,3,5:9".
     preset: a known sensor, in place of topic and field, see `presets`; of a file without topics it is only the sensor.
     rate: in Hz, counts times where a file has no clock.
-    labels: a topic with texts, or a column: what they say become episodes.
-    annotate: columns of a LeRobotDataset that say something of touches, as headings such as "force [N]" or
+    labels: a topic with texts, a column, or an array of one text, one an episode, or one a reading: they name episodes.
+    annotate: columns or arrays that say something of touches, as headings such as "force [N]" or
         "slip [label]", with " from observation.wrench[2]" behind it where the data set calls it otherwise; they become
         `annotations`.
     resample: a rate in Hz; see `resampled` for the rule. Readings are left as they are without it.
     header, delimiter, decimal: how a table is written, where it does not show.
-    definitions: of messages that a bag does not define, the text of the .msg by the type's name.
+    definitions: of messages that a bag does not define, a folder of .msg files (`package/msg/Name.msg`, or flat), or
+        their texts by the types' names. Presets bring those of their drivers.
 
     Raises FieldError where topic or field are not there or not given, listing what there is; RecordingError where the
     file is not there, damaged, ragged, empty, of no known format, or claims to hold more than one of its size can (see
@@ -76,7 +81,17 @@ def read(
     of another sensor; InputError for a clock that is not there.
     """
     request = Request(
-        topic, field, clock, rate, labels, header, delimiter, decimal, None, definitions or {}, tuple(annotate)
+        topic,
+        field,
+        clock,
+        rate,
+        labels,
+        header,
+        delimiter,
+        decimal,
+        None,
+        definitions_of(definitions),
+        tuple(annotate),
     )
     address = fspath(path)
     with local(address) as place, guarded(address):
@@ -100,14 +115,16 @@ def iterate(
     header: bool | None = None,
     delimiter: str | None = None,
     decimal: str = ".",
-    definitions: Mapping[str, str] | None = None,
+    definitions: _Definitions = None,
 ) -> Iterator[Recording]:
     """The readings of a file block by block, as recordings of at most 4096 readings: for files beyond memory.
 
     Arguments and errors are those of `read`. Blocks come in the order of the file, and each has the report of its own
     readings; the clock is chosen from the first.
     """
-    request = Request(topic, field, clock, rate, labels, header, delimiter, decimal, definitions=definitions or {})
+    request = Request(
+        topic, field, clock, rate, labels, header, delimiter, decimal, definitions=definitions_of(definitions)
+    )
     address = fspath(path)
     with local(address) as place:
         with guarded(address):
@@ -124,14 +141,14 @@ def iterate(
             yield recording
 
 
-def describe(path: _Address, *, definitions: Mapping[str, str] | None = None) -> Contents:
+def describe(path: _Address, *, definitions: _Definitions = None) -> Contents:
     """What a file has: its topics and fields with their shapes and rates, and a line to copy.
 
     Of a bag the first 2000 messages are looked at. Raises RecordingError as `read` does.
     """
     address = fspath(path)
     with local(address) as place, guarded(address):
-        return _open(place, address, Request(definitions=definitions or {})).contents()
+        return _open(place, address, Request(definitions=definitions_of(definitions))).contents()
 
 
 def find(path: _Address) -> list[Path]:
@@ -175,8 +192,8 @@ def _open(path: Path, address: str, request: Request, preset: str | None = None)
     if kind is None:
         what = "a folder that is none of these" if path.is_dir() else repr(path.name)
         raise RecordingError(
-            "expected a recording: .bag, .db3, .mcap, .npy, .csv, .h5, .zarr, the folder of a ROS 2 bag with its "
-            f"metadata.yaml, or of a LeRobot data set; came {what} at {address}"
+            "expected a recording: .bag, .db3, .mcap, .npy, .npz, .mat, .csv, .parquet, .feather, .h5, .zarr, the "
+            f"folder of a ROS 2 bag with its metadata.yaml, or of a LeRobot data set; came {what} at {address}"
         )
     if not path.is_dir():
         require_file(path)
@@ -190,7 +207,7 @@ def _open(path: Path, address: str, request: Request, preset: str | None = None)
             )
     if request.annotate and not source.annotate:
         raise InputError(
-            f"{address} has no columns to annotate touches by; expected a LeRobot data set; came "
+            f"{address} has no columns to annotate touches by; expected arrays; came "
             f"annotate={request.annotate[0]!r}: give values and labels in a table of intervals=",
             argument="annotate intervals",
         )
@@ -198,20 +215,20 @@ def _open(path: Path, address: str, request: Request, preset: str | None = None)
 
 
 def _kind(path: Path) -> type[Source] | None:
-    from scroll_tactile.recordings import arraystores, delimited, lerobot, rosbag, zarrfile
+    from scroll_tactile.recordings import arraystores, columnar, delimited, rosbag, zarrfile
 
     if rosbag.is_rosbag(path):
         return rosbag.RosBag
-    if path.is_dir() and lerobot.is_lerobot(path):
-        return lerobot.LeRobot
+    if path.is_dir() and columnar.is_lerobot(path):
+        return columnar.LeRobot
     if zarrfile.is_zarr(path):
-        return arraystores.ZarrBuffer
+        return zarrfile.ZarrBuffer
     suffix = "" if path.is_dir() else path.suffix.lower()
-    if suffix in (".h5", ".hdf5", ".hdf"):
-        return arraystores.Hdf5
     if suffix and delimited.is_table(path):
         return delimited.Delimited
-    return arraystores.Npy if suffix == ".npy" else None
+    kinds: dict[str, type[Source]] = {".npy": arraystores.Npy, ".npz": arraystores.Npz, ".mat": arraystores.Mat}
+    kinds |= dict.fromkeys((".h5", ".hdf5", ".hdf"), arraystores.Hdf5)
+    return (kinds | dict.fromkeys((".parquet", ".feather"), columnar.Columnar)).get(suffix)
 
 
 def _timed(source: Source, request: Request) -> Iterator[Block]:
@@ -333,7 +350,7 @@ def assemble(
         readings = readings[order]
         clocks = {name: times[order] for name, times in clocks.items()}
         counters = {name: counts[order] for name, counts in counters.items()}
-    episodes = _spans(clocks["log"], source.marks) if source.marks else _numbered(block.episodes, source.names)
+    episodes = _spans(clocks["log"], source.marks) if source.marks else _numbered(block.episodes, source)
     begins = [] if source.marks or source.continuous else [episode.begin for episode in episodes if episode.begin]
     times = np.full(len(readings), np.nan) if clock is None else unwrapped(clocks[clock])
     unset = int(np.count_nonzero(clocks["header"] == 0)) if "header" in clocks else 0
@@ -356,11 +373,12 @@ def unwrapped(times: _Times) -> _Times:
     return times
 
 
-def _numbered(numbers: npt.NDArray[np.int64] | None, names: dict[int, str]) -> tuple[Episode, ...]:
+def _numbered(numbers: npt.NDArray[np.int64] | None, source: Source) -> tuple[Episode, ...]:
     if numbers is None:
         return ()
     borders = [0, *(np.flatnonzero(np.diff(numbers)) + 1).tolist(), len(numbers)]
-    return tuple(Episode(begin, end, names.get(int(numbers[begin]))) for begin, end in itertools.pairwise(borders))
+    spans = [(begin, end, int(numbers[begin])) for begin, end in itertools.pairwise(borders)]
+    return tuple(Episode(begin, end, source.names.get(n), source.paths.get(n, "")) for begin, end, n in spans)
 
 
 def _spans(logged: npt.NDArray[np.float64], marks: list[tuple[float, str]]) -> tuple[Episode, ...]:

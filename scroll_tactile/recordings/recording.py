@@ -44,11 +44,15 @@ def longest_step(step: float) -> float:
 
 @dataclass(frozen=True)
 class Episode:
-    """Readings [begin, end) of a recording, and what they are called; None where nothing names them."""
+    """Readings [begin, end) of a recording, and what they are called; None where nothing names them.
+
+    path: where in the file they lie, such as "run/felt/1/tactile", where a pattern found them.
+    """
 
     begin: int
     end: int
     name: str | None = None
+    path: str = ""
 
 
 @dataclass(frozen=True)
@@ -229,7 +233,7 @@ def resampled(recording: Recording, rate: float, breaks: Sequence[int] | None = 
     lines = [_line(recording.times[begin:end], recording.readings[begin:end], rate, nowhere) for begin, end in spans]
     lengths = itertools.accumulate((len(grid) for grid, _ in lines), initial=0)
     begins = dict(zip(borders, lengths, strict=True))
-    episodes = tuple(Episode(begins[e.begin], begins[e.end], e.name) for e in recording.episodes)
+    episodes = tuple(replace(e, begin=begins[e.begin], end=begins[e.end]) for e in recording.episodes)
     readings = np.concatenate([values for _, values in lines]) if lines else recording.readings
     note = f"resampled to {rate:g} Hz, linear in time, from {len(recording)} readings"
     report = replace(

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import itertools
 import re
-import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from io import BytesIO
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -15,11 +16,11 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import FieldError, RecordingError
-from scroll_tactile.libraries import missing
+from scroll_tactile.libraries import optional
 from scroll_tactile.recordings import presets
-from scroll_tactile.recordings.bagfiles import Channel, Message, Scan, inflated, scan_bag, scan_db3, scan_mcap
+from scroll_tactile.recordings.bagfiles import ZSTD, Channel, Message, Scan, inflated
 from scroll_tactile.recordings.blocks import Block, Contents, Entry, Request, Source, floats, rows_of
-from scroll_tactile.recordings.bounds import Budget, read_text, require_inside, stored_bytes
+from scroll_tactile.recordings.bounds import read_text, require_inside, stored_bytes
 from scroll_tactile.recordings.decoding import MessageTypes
 from scroll_tactile.recordings.paths import FieldPath, fields_of, nearest
 
@@ -28,12 +29,9 @@ __all__ = ["SUFFIXES", "RosBag", "is_rosbag", "picture"]
 SUFFIXES = (".bag", ".mcap", ".db3")
 """What ROS's recordings end in."""
 
-# What is needed of metadata.yaml, as rosbag2 writes it: each with the lines below it that lie deeper, or are a list's.
-_LISTED = re.compile(r"^  (?:relative_file_paths|compression_mode):.*\n(?:(?:  +- |   ).*\n)*", re.MULTILINE)
-
 _LOOKED = 2000  # messages are looked at to say what a bag holds
-_DEEPEST = 32  # lists of metadata.yaml within each other, of which recorders write six
-_LONGEST, _LISTS = 1 << 24, 1 << 16  # bytes of metadata.yaml; and of the part that lists files: two thousand of them
+_TRIED = 10  # messages of a topic are decoded for it: the first may have empty arrays, or be damaged
+_LONGEST = 1 << 20  # bytes of metadata.yaml
 
 _PIXELS = 1 << 24  # of a compressed picture: 4096 × 4096, where the largest camera of a gel has 1600 × 1200
 
@@ -45,13 +43,16 @@ def is_rosbag(path: Path) -> bool:
 
 def _parts(folder: Path) -> list[Path]:
     """The parts of one recording in their order: files whose names differ in a last number alone; otherwise none."""
-    files = sorted((inside for inside in folder.iterdir() if _is_file(inside)), key=lambda file: _natural(file.name))
+
+    def order(file: Path) -> list[Any]:
+        return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", file.name)]
+
+    files = sorted((inside for inside in folder.iterdir() if _is_file(inside)), key=order)
     return files if len({re.sub(r"\d+(?=\.|$)", "", file.name, count=1) for file in files}) == 1 else []
 
 
 def _is_file(path: Path) -> bool:
-    name = path.name.lower().removesuffix(".zstd").removesuffix(".active")
-    return name.endswith(SUFFIXES)
+    return path.name.lower().removesuffix(".zstd").removesuffix(".active").endswith(SUFFIXES)
 
 
 class RosBag(Source):
@@ -61,86 +62,127 @@ class RosBag(Source):
 
     def __init__(self, path: Path, address: str, request: Request) -> None:
         super().__init__(path, address, request)
-        self.files, self.compressed = _files(path)
-        self.types = MessageTypes(request)
+        self.files = _files(path) if path.is_dir() else [path]
+        self.types = MessageTypes(request.definitions)
+        self.odd: list[str] = []  # what was found before reading
+        for file in self.files:
+            self.budget.add(stored_bytes(file))
 
     def contents(self) -> Contents:
         """The numbers in the first messages of each topic, those of known sensors first."""
-        seen: dict[tuple[str, str], list[int]] = {}
-        entries: dict[tuple[str, str], list[Entry]] = {}
-        messages = itertools.islice(self._messages(lambda topic: True), _LOOKED)
-        for message in messages:
-            key = message.channel.topic, message.channel.type
-            seen.setdefault(key, []).append(message.log)
-            if key not in entries:
-                try:
-                    decoded = self.types.decode(message.channel, message.data, self.budget)
-                except RecordingError as error:
+        entries, count = self._entries(None)
+        looked = f"in its first {count} messages, among others perhaps" if count == _LOOKED else ""
+        return Contents(self.address, tuple(entries), looked, tuple(self.notes))
+
+    def _entries(self, path: FieldPath | None) -> tuple[list[Entry], int]:
+        """Where numbers are in the first messages, or where a path leads to some; and how many messages were seen.
+
+        Where it leads to none, further messages are looked at: a topic may begin late.
+        """
+        logs: dict[Channel, list[int]] = {}
+        found: dict[Channel, dict[str, tuple[int, ...]]] = {}
+        failed: dict[Channel, int] = {}
+        count = 0
+        for message in self._messages(lambda topic: True):
+            if count >= _LOOKED and (path is None or any(found.values())):
+                break
+            count, channel = count + 1, message.channel
+            logs.setdefault(channel, []).append(message.log)
+            fields = found.setdefault(channel, {})
+            if failed.get(channel, 0) >= _TRIED or (fields and (path is not None or len(logs[channel]) > _TRIED)):
+                continue
+            try:
+                decoded = self.types.decode(channel, message.data)
+                if path is not None:
+                    shapes = [(path.text, path.reading(decoded).shape)]
+                else:
+                    shapes = [*presets.fields_for(channel.type, decoded), *_numbers(decoded)]
+                for text, shape in shapes:
+                    fields |= {text: shape} if text not in fields and shape != (0,) else {}
+            except RecordingError as error:
+                failed[channel] = failed.get(channel, 0) + 1
+                if not isinstance(error, FieldError) and str(error) not in self.notes:
                     self.notes.append(str(error))
-                    entries[key] = []
-                    continue
-                fields = dict([*presets.fields_for(message.channel.type, decoded), *_numbers(decoded)])
-                entries[key] = [Entry(key[0], text, shape, kind=key[1]) for text, shape in fields.items()]
-        total = sum(map(len, seen.values()))
-        found = [
-            Entry(entry.topic, entry.field, entry.shape, len(logs), _rate(logs), entry.kind)
-            for key, logs in seen.items()
-            for entry in entries[key]
+        entries = [
+            Entry(channel.topic, text, shape, len(logs[channel]), _rate(logs[channel]), channel.type)
+            for channel, fields in found.items()
+            for text, shape in fields.items()
         ]
-        found.sort(key=lambda entry: not presets.is_known(entry.kind))
-        looked = f"in its first {total} messages, among others perhaps" if total == _LOOKED else ""
-        return Contents(self.address, tuple(found), looked, tuple(dict.fromkeys(self.notes)))
+        return sorted(entries, key=lambda entry: not presets.is_known(entry.kind)), count
 
     def blocks(self) -> Iterator[Block]:
         """The readings of the requested topic; raises FieldError, with what there is, for one that is not there."""
         topic, text = self._choose()
         self.topic = topic
-        path, stamps = FieldPath(text), Stamps(self.request.clock, text)
+        path, stamps = FieldPath(text), Stamps(self.request.clock, text, self.notes)
         rows: list[npt.NDArray[Any]] = []
-        width, most = -1, 1
-        for i, (message, decoded) in enumerate(self._decoded(topic)):
-            row = picture(decoded) if path.text == "data" else None
-            if row is None:
-                row = path.reading(decoded)
-            else:
-                self.budget.take(row.nbytes)
-            if width < 0:
+        width: int | None = None
+        most, empty = 1, 0
+        for message, decoded in self._decoded(topic):
+            row = _reading(path, decoded)
+            if not row.size:
+                empty += 1
+                continue
+            if width is None:
                 width, most = row.size, rows_of(max(row.nbytes, 4 * row.size))
-                if not width:
-                    raise FieldError(f"field {text!r} of topic {topic!r} holds no value: its array is empty")
             if row.size != width:
-                raise RecordingError(
-                    f"{self.address}: readings are ragged: message {i} of {topic!r} has {row.size} values in {text!r}, "
-                    f"where those before have {width}. Name elements that each message has, as in {text}[0:{width}]"
-                )
+                raise self._ragged(topic, path)
             rows.append(row)
             stamps.add(message, decoded)
             if len(rows) >= most:
                 yield Block(floats(np.stack(rows)), *stamps.take())
                 rows = []
+        if empty and width is None:
+            raise FieldError(f"field {text!r} of topic {topic!r} holds no value: its array is empty in each message")
+        if empty:
+            self.notes.append(f"{empty} messages have an empty array in {text!r}, and were left out")
         if rows:
             yield Block(floats(np.stack(rows)), *stamps.take())
-        if width < 0:
+        if width is None:
             self._absent(topic)
         if self.request.labels is not None and not self.marks:
             self._absent(self.request.labels)
 
+    def _ragged(self, topic: str, path: FieldPath) -> RecordingError:
+        """The error of readings that differ in size, with a field that each message has where there is such a one."""
+        counts: dict[int, int] = {}
+        samples: dict[int, Any] = {}
+        for _, decoded in self._decoded(topic):
+            size = _reading(path, decoded).size
+            counts[size], samples[size] = counts.get(size, 0) + 1, decoded
+        samples.pop(0, None)
+        least, cure = min(samples), ""
+        shorter = re.sub(r"\[(\d*):\d*\]$", lambda m: f"[{m[1] or 0}:{int(m[1] or 0) + least}]", path.text)
+        some = (path.text.replace("[*]", f"[0:{least // of}]", 1) for of in range(1, least + 1))
+        for text in (shorter, f"{path.text}[0:{least}]", *some):
+            with suppress(FieldError):
+                if not cure and len({FieldPath(text).reading(sample).size for sample in samples.values()}) == 1:
+                    cure = f". Name elements that each of them has, as in field={text!r}"
+        sizes = ", ".join(f"{counts[size]} have {size} values" for size in sorted(samples))
+        return RecordingError(
+            f"{self.address}: readings are ragged: of {topic!r} in {path.text!r} {sizes}{cure}", argument="field"
+        )
+
     def _decoded(self, topic: str) -> Iterator[tuple[Message, Any]]:
         """The messages of a topic as objects; those of the topic that labels go to `marks`."""
         labels = self.request.labels
-        decoded, unfit = None, 0
+        unfit, fit = 0, 0
+        why: RecordingError | None = None
         for message in self._messages(lambda name: name in (topic, labels)):
             try:
-                decoded = self.types.decode(message.channel, message.data, self.budget)
-            except RecordingError:
-                if decoded is None:
-                    raise
-                unfit += 1
+                decoded = self.types.decode(message.channel, message.data)
+            except RecordingError as error:
+                unfit, why = unfit + 1, error
+                if not fit and unfit >= _TRIED:  # of another type, and not damaged
+                    break
                 continue
+            fit += 1
             if message.channel.topic == labels:
                 self.marks.append((message.log / 1e9, _text_in(decoded, message.channel)))
             if message.channel.topic == topic:
                 yield message, decoded
+        if why is not None and not fit:
+            raise why
         if unfit:
             self.notes.append(f"{unfit} messages do not fit their type, and were left out")
 
@@ -149,114 +191,77 @@ class RosBag(Source):
         topic, text = self.request.topic, self.request.field
         if topic is not None and text is not None:
             return topic, text
-        topics = self._having(FieldPath(text)) if text is not None else []
-        if len(topics) == 1 and text is not None:
-            return topics[0], text
+        what = "expected a topic and a field to read"
+        entries: list[Entry] = []
+        if text is not None:
+            entries, _ = self._entries(FieldPath(text))
+            topics = {entry.topic for entry in entries}
+            if len(topics) == 1 or self.request.likely in topics:
+                topic = self.request.likely if len(topics) > 1 else entries[0].topic
+                self.odd = [f"{other} has such readings, too" for other in sorted(map(str, topics - {topic}))]
+                return str(topic), text
+            what = f"{'several topics have' if topics else 'no topic has'} a field {text!r}"
         contents = self.contents()
-        if text is not None and contents.entries:
-            raise contents.refused(f"{'several topics have' if topics else 'no topic has'} a field {text!r}")
-        entries = tuple(entry for entry in contents.entries if topic in (None, entry.topic))
+        entries = entries or [entry for entry in contents.entries if topic in (None, entry.topic)]
         if not entries:
             self._absent(topic)
-        raise Contents(contents.source, entries).refused("expected a topic and a field to read")
-
-    def _having(self, path: FieldPath) -> list[str]:
-        """The topics in whose first message a path leads to numbers; the likely one alone where it is among them."""
-        topics: dict[str, bool] = {}
-        for message in itertools.islice(self._messages(lambda name: True), _LOOKED):
-            topic = message.channel.topic
-            if topic not in topics:
-                topics[topic] = False
-                with suppress(RecordingError):
-                    topics[topic] = path.reading(self.types.decode(message.channel, message.data, self.budget)).size > 0
-                if topics[topic] and topic == self.request.likely:
-                    return [topic]
-        return [topic for topic, has in topics.items() if has]
+        raise replace(contents, entries=tuple(entries)).refused(what)
 
     def _absent(self, topic: str | None) -> NoReturn:
-        problems = self.notes
+        problems = "; ".join(self.notes)
         messages = itertools.islice(self._messages(lambda name: True), _LOOKED)
         topics = dict.fromkeys(message.channel.topic for message in messages)
         if not topics:
-            raise RecordingError(
-                f"{self.address} holds no message" + (f": {'; '.join(self.notes)}" if self.notes else "")
-            )
-        if topic is None:
-            raise RecordingError(f"{self.address} has no numbers in {', '.join(topics)}: {'; '.join(problems)}")
+            problems = "; ".join(self.notes)
+            raise RecordingError(f"{self.address} holds no message" + (f": {problems}" if problems else ""))
+        if topic is None or topic in topics:
+            where = ", ".join(topics) if topic is None else topic
+            why = problems or "its arrays are empty, or it has none"
+            raise RecordingError(f"{self.address} has no numbers in {where}: {why}", argument="definitions")
         raise FieldError(f"{self.address} holds no message of topic {topic!r}{nearest(str(topic), list(topics))}")
 
     def _messages(self, wanted: Callable[[str], bool]) -> Iterator[Message]:
-        self.notes, self.cut_off, self.marks = [], False, []
-        self.budget = Budget(self.address)
-        for path in self.files:
-            self.budget.add(stored_bytes(path))
-            scan = Scan(wanted, self.budget)
-            if path.suffix.lower() != ".zstd":
-                yield from self._scanned(path, scan)
-            else:
-                with tempfile.TemporaryDirectory() as folder:
-                    yield from self._scanned(inflated(path, Path(folder), self.budget), scan)
+        self.notes[:] = self.odd
+        self.marks.clear()
+        self.cut_off = False
+        for file in self.files:
+            scan = Scan(file, wanted)
+            for message in scan.messages():
+                alone = message.data[:4] == ZSTD and message.channel.encoding == "cdr"  # compressed by itself
+                yield message._replace(data=inflated(message.data, scan.room)) if alone else message
             if scan.cut_off is not None:
                 self.cut_off = True
-                self.notes.append(f"{path.name} was cut off: {scan.cut_off}; what comes before was read")
+                self.notes.append(f"{file.name} was cut off: {scan.cut_off}; what comes before was read")
             if scan.damaged:
-                self.notes.append(f"{path.name} has {scan.damaged} damaged chunks, which were left out")
-
-    def _scanned(self, file: Path, scan: Scan) -> Iterator[Message]:
-        name = file.name.lower().removesuffix(".active")
-        if name.endswith(".bag"):
-            return scan_bag(file, scan)
-        if name.endswith(".mcap"):
-            return scan_mcap(file, scan)
-        return scan_db3(file, scan, compressed=self.compressed)
+                self.notes.append(f"{file.name} has {scan.damaged} damaged chunks, which were left out")
 
 
-def _files(path: Path) -> tuple[list[Path], bool]:
-    """The files of a recording in their order, and whether its messages are compressed one by one."""
-    if not path.is_dir():
-        return [path], False
-    there = files = _parts(path)
-    listed, compressed = path / "metadata.yaml", False
+def _files(folder: Path) -> list[Path]:
+    """The files of a recording in their order: those that it lists, or those that are there."""
+    there = files = _parts(folder)
+    listed = folder / "metadata.yaml"
     if listed.exists():
-        about = _listing(path, listed)
-        compressed = str(about.get("compression_mode", "")).lower() == "message"
-        files = [path / Path(str(name)).name for name in about["relative_file_paths"]]
+        with optional("rosbags", "ros", "a ROS recording"):
+            from ruamel.yaml import YAML  # comes with rosbags
+        about = YAML(typ="safe").load(read_text(folder, listed, _LONGEST))
+        if about is None:
+            raise RecordingError(f"{listed} is empty, as after a power cut: remove it, and the parts there are read")
+        names = about["rosbag2_bagfile_information"]["relative_file_paths"]
+        files = [folder / Path(name).name for name in names if isinstance(name, str)]
     if absent := [file.name for file in files if not file.exists()]:
         raise RecordingError(
             f"{listed} lists {', '.join(absent)}, which are not there: copy them, or read the parts that are there, "
             f"{', '.join(p.name for p in there) or 'none'}, one by one"
         )
     for file in files:
-        require_inside(path, file)
-    return files, compressed
+        require_inside(folder, file)
+    return files
 
 
-def _listing(path: Path, listed: Path) -> Any:
-    """The part of a metadata.yaml that lists files; raises RecordingError where reading it would take for ever."""
-    try:
-        from ruamel.yaml import YAML, AliasEvent  # comes with rosbags
-        from ruamel.yaml.events import CollectionEndEvent, CollectionStartEvent
-    except ImportError as error:
-        raise missing("rosbags", "ros", "a ROS recording", cause=error) from error
-    text = read_text(path, listed, _LONGEST)
-    parts = [text[match.start() : match.end()] for match in _LISTED.finditer(text)]
-    # The whole text takes as long as a hundred messages do.
-    lists = "".join(parts) if len(parts) == 2 else text
-    if len(lists) > _LISTS:
-        raise RecordingError(f"{listed} lists its files in {len(lists)} letters; expected at most {_LISTS}")
-    depth = 0
-    for event in YAML(typ="safe").parse(lists):
-        if isinstance(event, AliasEvent):
-            raise RecordingError(f"{listed} has aliases, which no recorder writes, and which can stand for any length")
-        depth += isinstance(event, CollectionStartEvent) - isinstance(event, CollectionEndEvent)
-        if depth > _DEEPEST:  # each level makes all that follows slower
-            raise RecordingError(f"{listed} has more than {_DEEPEST} lists within each other")
-    about = YAML(typ="safe").load(lists)
-    return about if len(parts) == 2 else about["rosbag2_bagfile_information"]
-
-
-def _natural(name: str) -> list[Any]:
-    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", name)]
+def _reading(path: FieldPath, message: Any) -> npt.NDArray[Any]:
+    """The pixels of a picture, or else the numbers that a path leads to; none of a driver that was not ready."""
+    pixels = picture(message) if path.text == "data" else None
+    return path.reading(message) if pixels is None else pixels
 
 
 def _rate(logs: list[int]) -> float | None:
@@ -265,17 +270,20 @@ def _rate(logs: list[int]) -> float | None:
     return 1e9 / middle if middle > 0 else None
 
 
+def _value(message: Any, name: str) -> Any:
+    return message.get(name) if isinstance(message, Mapping) else getattr(message, name, None)
+
+
 def _numbers(message: object, before: str = "", depth: int = 0) -> Iterator[tuple[str, tuple[int, ...]]]:
     """The paths to numbers in a message, and the shapes of what they lead to, arrays first."""
     scalars = []
     for name in fields_of(message):
-        value = message[name] if isinstance(message, dict) else getattr(message, name)
-        text = f"{before}{name}"
+        value, text = _value(message, name), f"{before}{name}"
         if (array := _array(value)) is not None:
             yield text, array.shape
         elif isinstance(value, list) and value and fields_of(value[0]) and depth < 4:
-            inner = list(_numbers(value[0], f"{text}[*].", depth + 1))
-            yield from ((path, (len(value), *shape)) for path, shape in inner)
+            for path, shape in _numbers(value[0], f"{text}[*].", depth + 1):
+                yield path, (len(value), *shape)
         elif fields_of(value) and name not in ("header", "stamp", "layout") and depth < 4:
             yield from _numbers(value, f"{text}.", depth + 1)
         elif isinstance(value, int | float) and not isinstance(value, bool):
@@ -296,7 +304,7 @@ def _array(value: object) -> npt.NDArray[Any] | None:
 
 def _text_in(message: object, channel: Channel) -> str:
     """The text of a message of labels: of `data`, or of its only field with text."""
-    texts = {name: getattr(message, name, None) for name in fields_of(message)}
+    texts = {name: _value(message, name) for name in fields_of(message)}
     found = {name: text for name, text in texts.items() if isinstance(text, str)}
     if "data" in found or len(found) == 1:
         return found.get("data") or next(iter(found.values()))
@@ -323,10 +331,8 @@ def picture(message: Any) -> npt.NDArray[np.uint8] | None:
 
 
 def _decompressed(data: bytes) -> npt.NDArray[np.uint8]:
-    try:
+    with optional("Pillow", "gelsight", "a topic of compressed pictures"):
         from PIL import Image
-    except ImportError as error:
-        raise missing("Pillow", "gelsight", "a topic of compressed pictures", cause=error) from error
     # What sensors send: decoders of other formats start programs, or were not made for files from elsewhere.
     with Image.open(BytesIO(data), formats=("JPEG", "PNG")) as picture:
         if picture.width * picture.height > _PIXELS:
@@ -336,10 +342,10 @@ def _decompressed(data: bytes) -> npt.NDArray[np.uint8]:
 
 # The clocks and counters of messages: the device's, a header's, when a message was sent, when it was logged.
 
+_Times = npt.NDArray[np.float64]
+
 CLOCKS = ("device", "header", "publish", "log")
 """The clocks of a message, the one to prefer first."""
-
-_Times = npt.NDArray[np.float64]
 
 # What drivers call their device's own clock and count, beside the numbers or at the top of the message.
 _DEVICE = ("tus", "time_us", "timestamp_us", "device_time", "device_timestamp", "hw_timestamp", "timestamp", "time")
@@ -348,104 +354,105 @@ _UNITS = {"us": 1e-6, "ns": 1e-9, "ms": 1e-3}
 
 
 class Stamps:
-    """Collects the clocks and counters of messages, for one block after the other."""
+    """Collects the clocks and counters of messages, for one block after the other; says in `notes` what is odd."""
 
-    def __init__(self, clock: str | None, field: str) -> None:
-        self.clock = clock
-        self.field = field
-        self.device: tuple[str, FieldPath] | None = None
-        self.counter: FieldPath | None = None
-        self.header = False
+    def __init__(self, clock: str | None, field: str, notes: list[str]) -> None:
+        self.clock, self.field, self.notes = clock, field, notes
+        self.device = ""  # the path to its clock
+        self.clocks: dict[str, Callable[[Message, Any], Any]] = {}
+        self.counters: dict[str, Callable[[Message, Any], int]] = {}
+        self.values: dict[str, list[Any]] = {}
         self.unit: float | None = None
-        self.begun = False
-        self._empty()
-
-    def _empty(self) -> None:
-        self.times: dict[str, list[int]] = {name: [] for name in ("header", "publish", "log")}
-        self.values: list[Any] = []
-        self.counts: dict[str, list[int]] = {"message": [], "sequence": [], "all": []}
+        self.coarse: list[str] | None = None
+        self.last, self.turns = 0.0, 0  # of the device's clock, and how often it has turned over
 
     def add(self, message: Message, decoded: Any) -> None:
         """Take the stamps of one message."""
-        if not self.begun:
-            self._begin(decoded)
-        self.times["log"].append(message.log)
-        if message.publish is not None:
-            self.times["publish"].append(message.publish)
-        if self.header:
-            self.times["header"].append(_nanoseconds(decoded.header.stamp))
-        if self.device is not None:
-            self.values.append(_stamp(self.device[1], decoded))
-        if self.counter is not None:
-            self.counts["message"].append(int(self.counter.values(decoded)[0]))
-        if message.sequence is not None:  # of the topic, or of all of them: then less the others it goes on by one
-            self.counts["sequence"].append(message.sequence)
-            self.counts["all"].append(message.sequence - message.others)
+        if not self.clocks:
+            self._begin(message, decoded)
+        for name, stamp in self.clocks.items():
+            self.values[name].append(stamp(message, decoded))
+        for name, count in self.counters.items():
+            self.values[name].append(count(message, decoded))
 
     def take(self) -> tuple[dict[str, _Times], dict[str, npt.NDArray[np.int64]]]:
         """The clocks in seconds and the counters since the last time, in the order of preference."""
         clocks = {}
-        log = _seconds(self.times["log"])
-        if self.device is not None:
-            name = "device" if self.clock is None or self.clock in CLOCKS else self.clock
-            values = np.array(self.values, np.float64)
+        for name in self.clocks:
+            if name in CLOCKS[1:]:
+                clocks[name] = _seconds(self.values[name])
+                continue
+            values = self._turned(self.values[name])
             if self.unit is None:
-                self.unit = _unit(self.device[0], self.values, values, log)
+                self.unit = _unit(self.device, self.values[name], values, _seconds(self.values["log"]))
             clocks[name] = values * self.unit if self.unit >= 1 else values / round(1 / self.unit)
-        for name, stamps in self.times.items():
-            if stamps:
-                clocks[name] = _seconds(stamps)
-        counts = {name: np.array(values, np.int64) for name, values in self.counts.items() if values}
-        self._empty()
+        if self.coarse is None:
+            self.coarse = [name for name in ("device", "header") if name != self.clock and _is_coarse(clocks.get(name))]
+            self.notes += [f"the {name}'s stamps are whole seconds: times are another clock's" for name in self.coarse]
+        for name in self.coarse:
+            del clocks[name]
+        counts = {name: np.array(self.values[name], np.int64) for name in self.counters}
+        self.values = {name: [] for name in self.values}
         return clocks, counts
 
-    def _begin(self, decoded: Any) -> None:
-        self.begun = True
-        stamp = getattr(getattr(decoded, "header", None), "stamp", None)
-        self.header = hasattr(stamp, "sec") and hasattr(stamp, "nanosec")
+    def _begin(self, message: Message, decoded: Any) -> None:
         root = re.match(r"\s*\w+\[-?\d+\]\.", self.field)
         before = ["", *([root.group().strip()] if root else [])]
         if self.clock is not None and self.clock not in CLOCKS:
-            path = FieldPath(self.clock)
-            _stamp(path, decoded)
-            self.device = (self.clock, path)
+            path: FieldPath | None = FieldPath(self.clock)
         else:
-            self.device = _first(decoded, [f"{b}{name}" for b in before for name in _DEVICE])
-        counter = _first(decoded, ["header.seq", *(f"{b}{name}" for b in before for name in _COUNTER)], counts=True)
-        self.counter = None if counter is None else counter[1]
+            path = _first_of(decoded, [f"{b}{name}" for b in before for name in _DEVICE])
+        if (device := path) is not None:
+            name = "device" if self.clock in (None, *CLOCKS) else str(self.clock)
+            self.device, self.clocks[name] = device.text, lambda _, decoded: _stamp(device, decoded)
+        header = _json_header if isinstance(decoded, Mapping) else attrgetter("header.stamp")
+        with suppress(AttributeError, KeyError, TypeError):
+            if _nanoseconds(header(decoded)) is not None:
+                self.clocks["header"] = lambda _, decoded: _nanoseconds(header(decoded))
+        if message.publish is not None:
+            self.clocks["publish"] = lambda message, _: message.publish
+        self.clocks["log"] = lambda message, _: message.log
+        paths = ["header.seq", *(f"{b}{name}" for b in before for name in _COUNTER)]
+        if (counter := _first_of(decoded, paths, counts=True)) is not None:
+            self.counters["message"] = lambda _, decoded: int(counter.values(decoded)[0])
+        if message.sequence is not None:  # of the topic, or of all of them: then less the others it goes on by one
+            self.counters["sequence"] = lambda message, _: message.sequence or 0
+            self.counters["all"] = lambda message, _: (message.sequence or 0) - message.others
+        self.values = {name: [] for name in (*self.clocks, *self.counters)}
+
+    def _turned(self, values: list[Any]) -> _Times:
+        """A device's clock that goes on where it turns over, as one of 16 bits does after a minute of milliseconds."""
+        times = np.array(values, np.float64)
+        bits = 16 if times.max() < 2**16 else 32
+        if times.max() < 2**bits and all(isinstance(value, int) for value in values):
+            steps = np.diff(times, prepend=self.last if self.turns or self.last else times[0])
+            usual = np.median(steps[steps > 0]) if (steps > 0).any() else 0
+            turns = self.turns + np.cumsum((steps < 0) & (steps + 2**bits <= 5 * usual))
+            self.last, self.turns = times[-1], turns[-1]
+            times = times + turns * 2.0**bits
+        return times
 
 
-def _first(decoded: Any, texts: list[str], counts: bool = False) -> tuple[str, FieldPath] | None:
+def _json_header(decoded: Any) -> Any:
+    return decoded["header"]["stamp"]
+
+
+def _first_of(decoded: Any, texts: list[str], counts: bool = False) -> FieldPath | None:
     """The first of some paths that leads to a stamp, or to a whole number where it `counts`."""
-    names: dict[str, set[str]] = {}  # of what stands before the last dot; an error with the nearest takes long
     for text in texts:
-        before, _, name = text.rpartition(".")
-        if before not in names:
-            names[before] = _names(decoded, before)
-        if name.lower() not in names[before]:
-            continue
         path = FieldPath(text)
         with suppress(FieldError):
             value = _stamp(path, decoded)
             if not counts or isinstance(value, int):
-                return text, path
+                return path
     return None
-
-
-def _names(decoded: Any, text: str) -> set[str]:
-    """The fields, in lower case, of the message that a path leads to; none where it leads to none."""
-    try:
-        found = FieldPath(text).values(decoded) if text else [decoded]
-    except FieldError:
-        return set()
-    return {name.lower() for name in fields_of(found[0])} if len(found) == 1 else set()
 
 
 def _stamp(path: FieldPath, decoded: Any) -> float:
     found = path.values(decoded)
     value = found[0] if len(found) == 1 else None
-    if hasattr(value, "sec") and hasattr(value, "nanosec"):
-        return _nanoseconds(value) / 1e9
+    if not isinstance(value, int | float) and (stamp := _nanoseconds(value)) is not None:
+        return stamp / 1e9
     if isinstance(value, np.integer | np.floating):
         value = value.item()
     if isinstance(value, bool) or not isinstance(value, int | float):
@@ -453,14 +460,27 @@ def _stamp(path: FieldPath, decoded: Any) -> float:
     return value
 
 
-def _nanoseconds(stamp: Any) -> int:
-    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
+def _nanoseconds(stamp: Any) -> int | None:
+    """A time as ROS has it, or ROS's JSON; None for anything else."""
+    try:
+        return int(stamp.sec) * 10**9 + int(stamp.nanosec)
+    except AttributeError:
+        parts = [stamp.get(name) for name in ("sec", "nanosec", "nsec")] if isinstance(stamp, Mapping) else []
+        numbers = [part for part in parts if isinstance(part, int)]
+        return numbers[0] * 10**9 + numbers[1] if len(numbers) == 2 else None
 
 
 def _seconds(stamps: list[int]) -> _Times:
     # Whole seconds and their rest each round once; the quotient of nanoseconds as a double would round twice.
     whole = np.array([stamp // 10**9 for stamp in stamps], np.float64)
     return whole + np.array([stamp % 10**9 for stamp in stamps], np.float64) / 1e9
+
+
+def _is_coarse(times: _Times | None) -> bool:
+    """Whether times are whole seconds, of which most readings have the one of the reading before them."""
+    if times is None or not times.any() or (times % 1).any():
+        return False
+    return bool(2 * np.count_nonzero(np.diff(times) == 0) > len(times))
 
 
 def _unit(text: str, values: list[Any], times: _Times, log: _Times) -> float:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import csv
 import math
+import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike, fspath
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal, TextIO
@@ -74,9 +75,10 @@ def touches(recording: Recording, cut: Cut = "whole", label: Label = None) -> tu
 
     cut: "whole" (all readings are one touch), "episodes", a table's intervals (those of this file), or a function that
         gives the begin and end of each touch, such as one that watches for contact.
-    label: what names a touch: the "topic", the name of the "file" (without suffix) or of its "folder", or the "task"
-        that its episode is called. Without it intervals and episodes name their own, and the whole recording has no
-        name but that of all its episodes, where they have the same.
+    label: what names a touch: the "topic", the name of the "file" (without suffix) or of its "folder", the "task" that
+        its episode is called, or "group:2", the second part of the path in the file where a pattern found it; of those
+        "folder" is the first part in which their paths differ. Without it intervals and episodes name their own, and
+        the whole recording has no name but that of all its episodes, where they have the same.
 
     Raises InputError for a recording without episodes, without the requested label or with an empty one, for intervals
     of which none is of this file, which lie outside it, or overlap and name two materials, and for spans that a
@@ -92,7 +94,7 @@ def touches(recording: Recording, cut: Cut = "whole", label: Label = None) -> tu
         whole = Episode(0, len(recording), names.pop() if len(names) == 1 else None)
         spans = recording.episodes if cut == "episodes" else (whole,)
     elif callable(cut):
-        spans = tuple(Episode(begin, end, _during(recording, (begin + end) // 2)) for begin, end in cut(recording))
+        spans = tuple(_during(recording, begin, end) for begin, end in cut(recording))
         for span in spans:
             if not 0 <= span.begin < span.end <= len(recording):
                 raise InputError(f"a cut gave readings {span.begin} to {span.end} of {len(recording)}")
@@ -117,9 +119,27 @@ def _label(recording: Recording, span: Episode, label: Label) -> str | None:
     place = _place(recording.source)
     if label is None:
         return span.name
-    if label not in ("topic", "file", "folder", "task"):
-        raise InputError(f"expected a label by 'topic', 'file', 'folder' or 'task'; came {label!r}")
-    if label == "task":
+    level = re.fullmatch(r"group:(\d{1,4})", label, re.ASCII)
+    if level is None and label not in ("topic", "file", "folder", "task"):
+        raise InputError(f"expected a label by 'topic', 'file', 'folder', 'task' or 'group:2'; came {label!r}")
+    parts = [episode.path.split("/") for episode in recording.episodes if episode.path]
+    if level is not None or (label == "folder" and len(parts) > 1):
+        path = span.path.split("/")
+        differing = (i for i, names in enumerate(zip(*parts, strict=False)) if len(set(names)) > 1)
+        place_in = int(level[1]) - 1 if level else next(differing, 0)
+        name: str | None = path[place_in] if 0 <= place_in < len(path) else ""
+        if not span.path or not name or (level is None and not any(map(str.isalpha, name))):
+            there = ", ".join(f"by='group:{i + 1}', {part}" for i, part in enumerate(path[:-1]))
+            raise InputError(
+                f"{recording.source} has no {label} to be named by: readings {span.begin} to {span.end} lie in "
+                + (
+                    f"{span.path}; expected {there}"
+                    if span.path
+                    else "no groups that a pattern as group/*/tactile found"
+                ),
+                argument="by field",
+            )
+    elif label == "task":
         name = span.name
     elif label == "topic":
         name = None if recording.topic is None else recording.topic.rstrip("/").rpartition("/")[2]
@@ -130,9 +150,10 @@ def _label(recording: Recording, span: Episode, label: Label) -> str | None:
     return name.strip()
 
 
-def _during(recording: Recording, middle: int) -> str | None:
-    """The name of the episode in which the middle of a span lies."""
-    return next((e.name for e in recording.episodes if e.begin <= middle < e.end), None)
+def _during(recording: Recording, begin: int, end: int) -> Episode:
+    """A span, called as the episode is in which its middle lies."""
+    around = (e for e in recording.episodes if e.begin <= (begin + end) // 2 < e.end)
+    return replace(next(around, Episode(begin, end)), begin=begin, end=end)
 
 
 def _place(source: str) -> PurePosixPath:

@@ -4,11 +4,14 @@ import contextvars
 import json
 import pickle
 import re
+import sqlite3
 
+import bags
 import h5py
 import numpy as np
 import pytest
 from commands import refused, run
+from rosbags.typesys import get_types_from_msg
 
 from scroll_tactile import TactileLearner, recordings, sensors
 from scroll_tactile.clients.cli import terminal
@@ -202,3 +205,23 @@ def test_probabilities_are_written_with_six_digits():
     assert prediction.ranking_as_json() == [["felt", 0.123457], ["oak", 0.0], ["silk", 3e-9]]
     assert prediction.ranking_as_json(1) == [["felt", 0.123457]]
     assert Prediction(None, 0.0, (), float("inf"), False, 0.0).as_json()["novelty"] is None
+
+
+def test_the_definitions_that_an_error_asks_for_are_taken(tmp_path, monkeypatch):
+    """A bag of ROS 2 Humble, of a driver that no preset knows."""
+    store, kind = bags.typestore(2), "my/msg/Pad"
+    store.register(get_types_from_msg("float32[] values", kind))
+    values = np.random.default_rng(0).uniform(0, 4095, (200, 19)).astype(np.float32)
+    messages = [(bags.START + i / 100, store.types[kind](row)) for i, row in enumerate(values)]
+    path = bags.write(tmp_path / "b", store, {"/pad": messages}, form="db3")
+    with sqlite3.connect(path / "b.db3") as base:
+        base.execute("DROP TABLE message_definitions")
+    words = ("b", "--sensor", "biotac", "--topic", "/pad", "--field", "values")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "FOLDER").mkdir()
+    (tmp_path / "FOLDER" / "Pad.msg").write_text("float32[] values")
+    for line in (("learn", "m", *words, "--label", "felt"), ("report", words[0], "page.html", *words[1:])):
+        result = run(*line)
+        assert result.exit_code == 1 and "Give --definitions 'FOLDER', a folder with Pad.msg" in result.stderr
+        assert run(*line, "--definitions", "FOLDER").exit_code == 0
+    assert "--definitions FOLDER" in (tmp_path / "page.html").read_text()

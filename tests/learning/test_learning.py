@@ -131,7 +131,8 @@ class TestSources:
             assert isinstance(refused, Refused) and why in refused.why
 
     def test_contacts_of_a_camera_begin_with_the_frame_at_rest_and_share_none(self, tmp_path):
-        np.save(tmp_path / "gel.npy", np.concatenate([frames(GEL.materials[0], number, 5) for number in range(3)]))
+        pictures = np.concatenate([frames(GEL.materials[0], number, 5) for number in range(3)])
+        np.save(tmp_path / "gel.npy", pictures.astype(np.uint8))
         made = gel_learner()
         found = list(source_touches(made, str(tmp_path / "gel.npy"), SourceOptions(cut="contact", material="a")))
         with made.live() as session:
@@ -191,7 +192,7 @@ class TestLearn:
         require_same(learner, EXPECTED)
         why = {Path(each.source).name: each.why for each in done.refused}
         assert done.files == 11 and set(why) == {"bad.npy", "bad.csv", "other.npy", "short.npy", "nan.npy"}
-        assert "expected numbers, version 1 or 2" in why["bad.npy"] and "row 2, column 2" in why["bad.csv"]
+        assert "may be damaged" in why["bad.npy"] and "row 2, column 2" in why["bad.csv"]
         assert "another sensor's recording" in why["other.npy"] and "at least 2 readings" in why["short.npy"]
         assert "reading 0, channel 0 is nan" in why["nan.npy"]
 

@@ -85,10 +85,10 @@ def test_a_touch_with_two_labels_is_refused_and_the_others_are_learned(data):
     [
         ("wrench [N] 0..9 step 1", FieldError, r"3 numbers a reading; expected one.*from observation.wrench\[0\]"),
         ("wrench [N] 0..9 step 1 from wrench[7]", FieldError, "beyond its 3 columns"),
-        ("slip [N] 0..9 step 1", FieldError, "is of type string; expected numbers"),
+        ("slip [N] 0..9 step 1", FieldError, "'observation.slip' of .* holds string; expected numbers"),
         ("speed [label]", FieldError, "holds double; expected texts, or whole numbers"),
         ("said [label]", FieldError, "a text of 300 characters; expected labels of at most 200"),
-        ("image [label]", FieldError, "is of type video; expected texts"),
+        ("image [label]", FieldError, "holds video; expected texts"),
         ("slop [label]", FieldError, "nearest is 'observation.slip'|there are"),
         ("slip", InputError, r"expected a column as 'force \[N\]'"),
         ("force [N] 9..0 step 1", InputError, "a range whose low"),
@@ -107,8 +107,11 @@ def test_a_heading_is_read_from_its_end_and_a_range_makes_a_unit_of_any_word():
 
 def test_other_recordings_have_no_such_columns_and_none_is_resampled(data, tmp_path):
     np.save(tmp_path / "a.npy", TIP)
-    with pytest.raises(InputError, match="no columns to annotate touches by; expected a LeRobot data set"):
+    with pytest.raises(InputError, match="one array without a name, and no 'slip'"):
         read(tmp_path / "a.npy", annotate=[SLIP])
+    (tmp_path / "a.csv").write_text("a,b\n1,2\n3,4\n")
+    with pytest.raises(InputError, match="no columns to annotate touches by; expected arrays"):
+        read(tmp_path / "a.csv", annotate=[SLIP])
     with pytest.raises(InputError, match="take resample=, or annotate="):
         resampled(read(data, field="tip", annotate=[SLIP]), 50)
 
@@ -117,6 +120,6 @@ def test_other_recordings_have_no_such_columns_and_none_is_resampled(data, tmp_p
 def test_a_column_of_lists_is_no_column_of_labels(tmp_path, kind):
     value = [("a", "b")] if hasattr(kind, "key_type") else ["a"]
     path = lerobot(tmp_path / "s", notes=("string", pa.array([value] * 30, kind)))
-    said = r"file-000\.parquet of .* has no column 'observation\.notes' of texts, one a row"
+    said = r"'observation\.notes' of .* holds (fixed_size_)?(list|map)<.*; expected texts, or whole numbers"
     with pytest.raises(FieldError, match=said):
         read(path, field="observation.tactile.tip", annotate=["slip [label] from observation.notes"])

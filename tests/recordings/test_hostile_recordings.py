@@ -3,10 +3,8 @@
 What a recording from somebody else may not do stands in tests/test_strangers.py.
 """
 
-import contextlib
 import os
 import shutil
-import struct
 import sys
 import tracemalloc
 
@@ -16,57 +14,11 @@ import h5py
 import numpy as np
 import pytest
 import zarr
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from made import CODECS, FORMATS, SKIN, TIP, buffer, hdf5, lerobot, ros
-from numcodecs import Blosc, blosc
+from numcodecs import BZ2, Blosc
 
 from scroll_tactile.errors import FieldError, MissingLibraryError, RecordingError
 from scroll_tactile.recordings import bounds, decoding, describe, find, iterate, read, zarrfile
-
-# Frames of Blosc, which are taken apart here.
-HEADER = struct.Struct("<BBBBIII")
-HARMED = {
-    "empty": b"",
-    "a block far behind the end": HEADER.pack(2, 1, 0x20, 1, 65536, 65536, 2**31 - 1) + struct.pack("<i", 2**30),
-    "copied bytes that are not there": HEADER.pack(2, 1, 2, 1, 65536, 65536, 65552),
-    "another size": blosc.compress(np.zeros(65537, np.uint8), b"zstd", 1),
-    "blocks of no bytes": HEADER.pack(2, 1, 0x80, 1, 65536, 0, 20) + bytes(4),
-    "blocks larger than all": HEADER.pack(2, 1, 0x80, 1, 65536, 2**31, 20) + bytes(4),
-    "more blocks than bytes": HEADER.pack(2, 1, 0x80, 1, 65536, 1, 20) + bytes(4),
-    "a stream of a negative length": HEADER.pack(2, 1, 0x80, 1, 65536, 65536, 24) + struct.pack("<ii", 20, -5),
-    "a stream behind the end": HEADER.pack(2, 1, 0x80, 1, 65536, 65536, 24) + struct.pack("<ii", 20, 9),
-    "a compressor that was never used": HEADER.pack(2, 1, 0x60, 1, 65536, 65536, 25) + struct.pack("<iib", 20, 1, 0),
-    "items of no bytes": HEADER.pack(2, 1, 0x80, 0, 65536, 65536, 24) + struct.pack("<ii", 20, 0),
-}
-
-
-@pytest.mark.parametrize("frame", HARMED.values(), ids=HARMED)
-def test_a_frame_whose_lengths_are_not_what_is_there_is_refused(frame):
-    with pytest.raises((ValueError, RuntimeError)):
-        zarrfile._decompress_blosc(frame, np.empty(65536, np.uint8))
-
-
-@pytest.mark.parametrize(
-    ("by", "kind", "shuffle"), [(b"zstd", "<u4", blosc.BITSHUFFLE), (b"lz4", "<u2", blosc.SHUFFLE)]
-)
-@settings(deadline=None, max_examples=60)
-@given(seed=st.integers(0, 2**32 - 1))
-def test_no_harmed_frame_writes_outside_its_destination(by, kind, shuffle, seed):
-    rng = np.random.default_rng(seed)
-    frame = bytearray(blosc.compress(rng.integers(0, 17, 40_000).astype(np.uint8).view(kind), by, 1, shuffle))
-    early = min(len(frame), 96)
-    for _ in range(rng.integers(1, 4)):
-        at = int(rng.integers(early if rng.random() < 0.7 else len(frame)))
-        if rng.random() < 0.3:
-            frame[at : at + 4] = struct.pack("<I", int(rng.choice([0, 1, 2**31 - 1, 2**31, 2**32 - 1, len(frame)])))
-        else:
-            frame[at] = int(rng.integers(256))
-    around = np.full(40_000 + 2 * 4096, 0xA5, np.uint8)
-    with contextlib.suppress(ValueError, RuntimeError):
-        zarrfile._decompress_blosc(bytes(frame[: int(rng.integers(1, 2 * len(frame)))]), around[4096:-4096])
-    assert (around[:4096] == 0xA5).all()
-    assert (around[-4096:] == 0xA5).all()
 
 
 @pytest.mark.parametrize("name", FORMATS)
@@ -95,22 +47,28 @@ class TestZarr:
                 read(tmp_path / "a.zarr", field=f"a{i}").readings, values.reshape(531, 12).astype(float)
             )
 
-    def test_a_frame_of_zstd_need_not_say_its_size(self):
+    def test_a_frame_of_zstd_need_not_say_its_size(self, tmp_path):
         from backports import zstd
 
-        streaming = zstd.ZstdCompressor()
-        frame = streaming.compress(b"ab" * 1000) + streaming.flush()
-        assert bytes(zarrfile._decompressed("zstd", frame, 2000)) == b"ab" * 1000
-        for size in (1000, 3000):
-            with pytest.raises(RuntimeError):
-                zarrfile._decompressed("zstd", frame, size)
+        array = zarr.create_array(
+            tmp_path / "a.zarr", shape=(500, 4), chunks=(500, 4), dtype="f4", compressors=zarr.codecs.ZstdCodec()
+        )
+        array[:] = values = np.random.default_rng(5).normal(size=(500, 4)).astype("f4")
+        for data in (values.tobytes(), values.tobytes() * 2):
+            streaming = zstd.ZstdCompressor()
+            (tmp_path / "a.zarr/c/0/0").write_bytes(streaming.compress(data) + streaming.flush())
+            if len(data) > values.nbytes:
+                with pytest.raises(RecordingError):
+                    read(tmp_path / "a.zarr")
+            else:
+                np.testing.assert_array_equal(read(tmp_path / "a.zarr").readings, values)
 
     def test_other_codecs_are_named(self, tmp_path):
-        path = buffer(tmp_path, 2, compressors=Blosc("blosclz"))
-        with pytest.raises(RecordingError, match="written by blosclz of Blosc; expected lz4 or zstd"):
+        path = buffer(tmp_path, 2, compressors=BZ2())
+        with pytest.raises(FieldError, match=r"not read: data/tactile: it has the codecs \['bz2'\]; expected some of"):
             read(path, field="tactile")
         shutil.rmtree(path)
-        with pytest.raises(RecordingError, match="Arrays in shards have to be written without"):
+        with pytest.raises(FieldError, match="sharding_indexed"):
             read(buffer(tmp_path, 3, shards=(14, 20)), field="tactile")
 
     def test_what_was_never_written_is_its_fill_value(self, tmp_path):
@@ -136,8 +94,8 @@ class TestZarr:
         del array["data/tactile"], array["data/timestamp"]
         array.create_array("data/tactile", data=values, chunks=values.shape)
         calls = []
-        decompressed = zarrfile._decompressed
-        monkeypatch.setattr(zarrfile, "_decompressed", lambda *a: calls.append(a[2]) or decompressed(*a))
+        looked = zarrfile._require_chunk
+        monkeypatch.setattr(zarrfile, "_require_chunk", lambda *a: calls.append(a[2]) or looked(*a))
         blocks = list(iterate(tmp_path / "b.zarr", field="tactile"))
         assert calls.count(values.nbytes) == 1
         assert [len(block) for block in blocks] == [4096] * 4 + [20_000 - 4 * 4096]
@@ -149,7 +107,7 @@ class TestZarr:
         group.create_array("data/task", shape=(30,), dtype="U9")
         np.testing.assert_array_equal(read(path, field="tactile").readings, TIP)
         assert [entry.field for entry in describe(path).entries] == ["data/tactile"]
-        with pytest.raises(RecordingError, match=r"'data/task' cannot be read: .* its data type is '<U9'"):
+        with pytest.raises(FieldError, match=r"not read: data/task: its data type is '<U9'; expected numbers"):
             read(path, field="task")
 
 
@@ -314,7 +272,7 @@ def test_a_library_that_is_not_installed_is_named_and_no_file_called_damaged(
         monkeypatch.delitem(sys.modules, module)
     for module in (lacks, "compression"):
         monkeypatch.setitem(sys.modules, module, None)
-    decoding._reader.cache_clear()
+    decoding._readers.cache_clear()
     for look in (lambda: read(path, field="data", topic="/skin" if extra == "ros" else None), lambda: describe(path)):
         with pytest.raises(MissingLibraryError, match=named) as raised:
             look()

@@ -90,7 +90,7 @@ def test_dictionaries_and_lists_as_of_json():
         ("{fX", "expected a dot or an index"),
         ("{fX,}", "expected a field's name at character 5"),
         ("data data", "expected a dot or an index at character 6"),
-        ("data;", "expected a name"),
+        ("data;", "expected a dot or an index at character 5"),
         ("{" * 5000, "at most 32"),
     ],
 )

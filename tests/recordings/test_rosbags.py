@@ -17,6 +17,7 @@ from PIL import Image
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import get_types_from_msg
 
 from scroll_tactile.errors import ChannelCountError, FieldError, InputError, RecordingError
 from scroll_tactile.recordings import describe, find, iterate, read, resampled
@@ -245,6 +246,72 @@ def test_big_endian_messages_read_alike(tmp_path, store2):
     np.testing.assert_array_equal(read(path, topic="/skin", field="data").readings, values)
 
 
+@pytest.mark.parametrize("compress", ["", "bz2", "lz4", "STORAGE ZSTD"])
+def test_a_bag_that_was_cut_anywhere_gives_its_whole_messages(tmp_path, store1, store2, compress):
+    """As a power cut leaves it; of MCAP and of ROS 1, whose recorder then closed no index either."""
+    ros = 2 if compress == "STORAGE ZSTD" else 1
+    for form, store in (("mcap", store2), ("bag", store1)):
+        if compress and form != ("mcap" if ros == 2 else "bag"):
+            continue
+        values, messages = floats(store, 300)
+        path = bags.write(tmp_path / f"b.{form}", store, {"/skin": messages}, form=form, compress=compress)
+        path = path if path.is_file() else next(path.glob("*.mcap"))
+        whole, most = path.read_bytes(), 0
+        for end in [*range(0, len(whole), 997), len(whole) - 1]:
+            path.write_bytes(whole[:end])
+            try:
+                recording = read(path, topic="/skin", field="data")
+            except RecordingError as error:
+                assert not most, error
+                assert re.search("does not begin as|holds no message|no numbers", str(error)), error
+                continue
+            np.testing.assert_array_equal(recording.readings, values[: len(recording)])
+            assert len(recording) >= most
+            most = len(recording)
+            assert recording.report.cut_off or end > 0.9 * len(whole)
+        assert most == 300
+
+
+def test_a_part_of_a_compressed_bag_is_read_alone(tmp_path, store2):
+    values, messages = floats(store2, 30)
+    for compress in ("MESSAGE ZSTD", "FILE ZSTD"):
+        folder = bags.write(tmp_path / compress, store2, {"/skin": messages}, form="db3", compress=compress)
+        (part,) = (file for file in folder.iterdir() if file.suffix != ".yaml")
+        np.testing.assert_array_equal(read(part, topic="/skin", field="data").readings, values)
+    whole = part.read_bytes()
+    part.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(RecordingError):
+        read(part, topic="/skin", field="data")
+
+
+def test_messages_that_wait_in_a_write_ahead_log_are_read(tmp_path, store2):
+    values, messages = floats(store2, 30)
+    path = next(bags.write(tmp_path / "b", store2, {"/skin": messages}, form="db3").glob("*.db3"))
+    base = sqlite3.connect(path)
+    base.execute("PRAGMA journal_mode=WAL")
+    base.execute("PRAGMA wal_autocheckpoint=0")
+    base.execute("INSERT INTO messages (topic_id, timestamp, data) SELECT topic_id, timestamp + 10, data FROM messages")
+    base.commit()
+    (tmp_path / "copy").mkdir()
+    for file in path.parent.glob("*.db3*"):  # as a recorder left them that was stopped by force
+        shutil.copy(file, tmp_path / "copy")
+    base.close()
+    readings = read(tmp_path / "copy" / path.name, topic="/skin", field="data").readings
+    np.testing.assert_array_equal(np.sort(readings, 0), np.sort(np.repeat(values, 2, 0), 0))
+
+
+def test_a_bag_that_its_recorder_never_closed_is_read(tmp_path, store1):
+    values, messages = floats(store1, 300)
+    path = bags.write(tmp_path / "b.bag", store1, {"/skin": messages}, form="bag")
+    whole = path.read_bytes()
+    begin = whole.index(b"index_pos=") + len(b"index_pos=")
+    index = int.from_bytes(whole[begin : begin + 8], "little")
+    (tmp_path / "b.bag.active").write_bytes(whole[:begin] + bytes(8) + whole[begin + 8 : index])
+    recording = read(tmp_path / "b.bag.active", topic="/skin", field="data")
+    np.testing.assert_array_equal(recording.readings, values)
+    assert "its recorder did not close it" in str(recording.report)
+
+
 @pytest.mark.parametrize("form", ["bag", "mcap", "db3"])
 def test_a_file_that_was_cut_off_gives_what_comes_before(tmp_path, store1, store2, form):
     store = store1 if form == "bag" else store2
@@ -283,11 +350,12 @@ def test_a_message_that_does_not_fit_its_type_is_left_out_and_said(tmp_path, sto
     values, messages = floats(store2, 5)
     path = next(bags.write(tmp_path / "b", store2, {"/skin": messages}, form="db3").glob("*.db3"))
     base = sqlite3.connect(path)
-    base.execute("UPDATE messages SET data = ? WHERE id = 3", (b"\0\1\0\0\xff",))
+    base.execute("UPDATE messages SET data = ? WHERE id IN (1, 3)", (b"\0\1\0\0\xff",))
     base.commit()
-    recording = read(path, topic="/skin", field="data")
-    np.testing.assert_array_equal(recording.readings, values[[0, 1, 3, 4]])
-    assert "1 messages do not fit" in str(recording.report)
+    for options in ({"topic": "/skin", "field": "data"}, {"field": "data"}):
+        recording = read(path, **options)
+        np.testing.assert_array_equal(recording.readings, values[[1, 3, 4]])
+        assert "2 messages do not fit" in str(recording.report)
     base.execute("UPDATE messages SET data = ?", (b"\0\1\0\0\xff",))
     base.commit()
     base.close()
@@ -320,7 +388,7 @@ def test_ragged_empty_and_undefined(tmp_path, store2):
     rows = [np.zeros(19), np.zeros(19), np.zeros(20)]
     messages = [(bags.START + i, bags.array(store2, row)) for i, row in enumerate(rows)]
     path = bags.write(tmp_path / "ragged", store2, {"/skin": messages}, form="db3")
-    with pytest.raises(RecordingError, match=r"ragged: message 2 of '/skin' has 20 values .* have 19"):
+    with pytest.raises(RecordingError, match=r"ragged: of '/skin' in 'data' 2 have 19 values, 1 have 20 values"):
         read(path, topic="/skin", field="data")
     assert read(path, topic="/skin", field="data[0:19]").readings.shape == (3, 19)
     empty = bags.write(tmp_path / "empty", store2, {"/skin": messages[:1]}, form="db3")
@@ -336,19 +404,198 @@ def test_ragged_empty_and_undefined(tmp_path, store2):
     with pytest.raises(ChannelCountError, match="as of biotac-sp"):
         read(path, preset="biotac")
     assert read(path, preset="biotac-sp").readings.shape == (3, 24)
+
+
+def as_humble(path):
+    """A bag without definitions, as before ROS 2 Iron."""
     base = sqlite3.connect(next(path.glob("*.db3")))
-    base.execute("DELETE FROM message_definitions")  # as before ROS 2 Iron
+    base.execute("DROP TABLE message_definitions")
     base.commit()
     base.close()
-    with pytest.raises(RecordingError, match="pass definitions="):
-        read(path, preset="biotac-sp")
-    full = bags.DEFINITIONS["sr_robot_msgs/msg/BiotacAll"]
-    parts = {"sr_robot_msgs/Biotac": bags.DEFINITIONS["sr_robot_msgs/msg/Biotac"]}
-    parts |= {"std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id"}
-    parts |= {"builtin_interfaces/Time": "int32 sec\nuint32 nanosec"}
-    text = full + "".join(f"\n{'=' * 80}\nMSG: {name}\n{part}" for name, part in parts.items())
-    recording = read(path, preset="biotac-sp", definitions={"sr_robot_msgs/msg/BiotacAll": text})
-    np.testing.assert_array_equal(recording.readings[0], np.arange(24))
+    return path
+
+
+PILLARS = {
+    "v/msg/PillarState": "int32 id\nfloat32 dx\nfloat32 dy\nfloat32 dz\nfloat32 fx\nfloat32 fy\nfloat32 fz\n"
+    "bool in_contact\nint32 slip_state",
+    "v/msg/SensorState": "std_msgs/Header header\nint64 tus\nPillarState[] pillars\nfloat32 gfx\nfloat32 gfy\n"
+    "float32 gfz\nfloat32 gtx\nfloat32 gty\nfloat32 gtz\n",
+}
+SLIPS = "float32 friction_est\nfloat32 target_grip_force\nbool is_sd_active\nbool is_ref_loaded\n"
+
+
+@pytest.mark.parametrize("stamped", [True, False])
+@pytest.mark.parametrize("slips", ["", SLIPS, f"{SLIPS}bool is_contact\n"])
+def test_a_preset_brings_each_version_of_its_drivers_messages(tmp_path, store2, stamped, slips):
+    store = bags.typestore(2)
+    pillar, state = PILLARS.values()
+    kinds = get_types_from_msg(stamped * "std_msgs/Header header\n" + pillar, "v/msg/PillarState")
+    store.register(kinds | get_types_from_msg(state + slips, "v/msg/SensorState"))
+    forces, zeros = RNG.standard_normal((9, 3)).astype(np.float32), [0.0] * 3
+    head = [bags.header(store, 1.0)] * stamped
+    each = [
+        store.types["v/msg/PillarState"](*head, i, *zeros, *map(float, row), True, 0) for i, row in enumerate(forces)
+    ]
+    more = [0.5, 0.5, True, False, True][: slips.count("\n")]
+    message = store.types["v/msg/SensorState"](bags.header(store, 1.0), 7, each, *zeros, *zeros, *more)
+    path = as_humble(bags.write(tmp_path / "b", store, {"/hub_0/sensor_0": [(bags.START, message)]}, form="db3"))
+    np.testing.assert_array_equal(read(path, preset="papillarray").readings[0], forces.ravel())
+
+
+def test_a_preset_brings_its_drivers_messages(tmp_path, store2):
+    static, pads = store2.types["robotiq_tsf/msg/StaticData"], store2.types["robotiq_tsf/msg/Taxels"]
+    taxels = RNG.integers(0, 65536, (2, 28)).astype(np.uint16)
+    patch = store2.types["sensor_msgs/msg/ChannelFloat32"](name="p", values=np.arange(12, dtype=np.float32))
+    skin = store2.types["tactile_msgs/msg/TactileState"](bags.header(store2, 1.0), [patch])
+    for name, message, options, numbers in [
+        ("shadow", bags.biotac(store2, np.arange(24, dtype=np.int16), 1.0), {"preset": "biotac-sp"}, np.arange(24)),
+        ("xela", bags.uskin(store2, np.arange(48).reshape(16, 3), 1, 2.0), {"preset": "xela-uskin"}, np.arange(48)),
+        ("robotiq", static([pads(row) for row in taxels]), {"preset": "robotiq-tsf"}, taxels.ravel()),
+        ("agni", skin, {"field": "sensors[*].values"}, np.arange(12)),
+    ]:
+        path = as_humble(bags.write(tmp_path / name, store2, {"/skin": [(bags.START, message)]}, form="db3"))
+        np.testing.assert_array_equal(read(path, **options).readings, [numbers])
+        assert describe(path).entries
+
+
+def test_messages_of_other_drivers_take_a_folder_of_definitions(tmp_path, store2):
+    store = bags.typestore(2)
+    part, whole = "float32[] values", "std_msgs/Header header\nFinger[2] fingers"
+    store.register(get_types_from_msg(part, "my/msg/Finger") | get_types_from_msg(whole, "my/msg/Hand"))
+    fingers = [store.types["my/msg/Finger"](np.array([i, 2], np.float32)) for i in range(2)]
+    hand = store.types["my/msg/Hand"](bags.header(store, 1.0), fingers)
+    path = as_humble(bags.write(tmp_path / "b", store, {"/hand": [(bags.START, hand)]}, form="db3"))
+    options = {"topic": "/hand", "field": "fingers[*].values"}
+    for ask in ({}, options, {"field": "fingers[*].values"}, {"topic": "/hand"}):
+        with pytest.raises(RecordingError, match=r"my/msg/Hand .*Give definitions='FOLDER', a folder with Hand.msg"):
+            read(path, **ask)
+    for place in ("ros/my/msg", "flat", "other-main/msg"):
+        (folder := tmp_path / place).mkdir(parents=True)
+        with pytest.raises(InputError, match=r"expected a folder with \.msg files in it"):
+            read(path, **options, definitions=folder)
+        (folder / "Hand.msg").write_text(whole)
+        with pytest.raises(RecordingError, match=r"my/msg/Finger .*a folder with Finger.msg"):
+            read(path, **options, definitions=folder)
+        (folder / "Finger.msg").write_text(part)
+        assert read(path, **options, definitions=tmp_path / place.split("/")[0]).readings.tolist() == [[0, 2, 1, 2]]
+        assert read(path, **options, definitions=str(folder)).readings.tolist() == [[0, 2, 1, 2]]
+    given = {"my/msg/Hand": f"{whole}\n{'=' * 80}\nMSG: my/Finger\n{part}"}
+    assert read(path, **options, definitions=given).readings.tolist() == [[0, 2, 1, 2]]
+    (tmp_path / "flat" / "Hand.msg").write_text("float32 x")
+    with pytest.raises(RecordingError, match="does not fit its type my/msg/Hand"):
+        read(path, **options, definitions=tmp_path / "flat")
+
+
+@pytest.mark.parametrize("bad", [[0], [200], [0, 1, 399]])
+@pytest.mark.parametrize("field", ["data", "data[0:4]", "data[*]"])
+def test_a_message_whose_array_is_empty_is_left_out_and_said(tmp_path, store2, bad, field):
+    rows = [np.zeros(0) if i in bad else np.full(4, i) for i in range(400)]
+    messages = [(bags.START + i / 100, bags.array(store2, row)) for i, row in enumerate(rows)]
+    path = bags.write(tmp_path / "b", store2, {"/skin": messages}, form="mcap")
+    assert [entry.field for entry in describe(path).entries] == ["data"]
+    recording = read(path, field=field)
+    assert recording.readings[:, 0].tolist() == [i for i in range(400) if i not in bad]
+    assert f"{len(bad)} messages have an empty array in {field!r}, and were left out" in str(recording.report)
+
+
+def test_a_driver_that_was_not_ready_sends_no_sensors_no_taxels_and_nothing(tmp_path, store2):
+    values = RNG.integers(0, 65536, (10, 16, 3))
+    messages = [(bags.START + i / 100, bags.uskin(store2, row, i, i / 100)) for i, row in enumerate(values)]
+    messages[0][1].sensors.clear()
+    messages[4][1].sensors[0].taxels.clear()
+    path = bags.write(tmp_path / "b", store2, {"/xServTopic": messages}, form="mcap")
+    recording = read(path, preset="xela-uskin")
+    np.testing.assert_array_equal(recording.readings, np.delete(values, [0, 4], 0).reshape(8, 48))
+    assert "2 messages have an empty array" in str(recording.report) and recording.report.clock == "device"
+    for _, message in messages:
+        message.sensors.clear()
+    path = bags.write(tmp_path / "none", store2, {"/xServTopic": messages}, form="mcap")
+    with pytest.raises(RecordingError, match="has no numbers in /xServTopic: its arrays are empty"):
+        read(path, preset="xela-uskin")
+    with pytest.raises(FieldError, match="holds no value: its array is empty in each message"):
+        read(path, preset="xela-uskin", topic="/xServTopic")
+
+
+@pytest.mark.parametrize(
+    ("field", "sizes", "cure"),
+    [
+        ("data", [4, 2, 4], "data[0:2]"),
+        ("data[0:4]", [4, 2, 4], "data[0:2]"),
+        ("data[1:]", [4, 3, 4], "data[1:3]"),
+    ],
+)
+def test_readings_of_several_sizes_are_refused_with_a_field_that_all_have(tmp_path, store2, field, sizes, cure):
+    messages = [(bags.START + i, bags.array(store2, np.ones(size))) for i, size in enumerate(sizes)]
+    path = bags.write(tmp_path / "b", store2, {"/skin": messages}, form="mcap")
+    with pytest.raises(RecordingError, match=re.escape(f"as in field={cure!r}")):
+        read(path, field=field)
+    assert len(read(path, field=cure)) == len(sizes)
+
+
+def test_a_message_with_fewer_taxels_leaves_those_that_all_have(tmp_path, store2):
+    messages = [(bags.START + i / 100, bags.uskin(store2, np.ones((4 if i == 2 else 16, 3)), i, 1.0)) for i in range(5)]
+    path = bags.write(tmp_path / "b", store2, {"/xServTopic": messages}, form="mcap")
+    cure = "sensors[0].taxels[0:4].{x,y,z}"
+    with pytest.raises(RecordingError, match=re.escape("1 have 12 values, 4 have 48 values. Name elements that each")):
+        read(path, preset="xela-uskin")
+    with pytest.raises(RecordingError, match=re.escape(f"as in field={cure!r}")):
+        read(path, preset="xela-uskin")
+    assert read(path, field=cure).readings.shape == (5, 12)
+
+
+def test_a_topic_that_begins_late_is_found(tmp_path, store2):
+    _, early = floats(store2, 2500)
+    late = [(bags.START + 30 + i, bags.biotac(store2, np.arange(19, dtype=np.int16), 1.0 + i)) for i in range(3)]
+    path = bags.write(tmp_path / "b", store2, {"/skin": early, "/my/hand": late}, form="mcap")
+    assert len(read(path, preset="biotac")) == 3
+
+
+def test_two_hands_at_two_rates_are_asked_for(tmp_path, store2):
+    hands = {
+        name: [(bags.START + i / rate, bags.biotac(store2, np.full(19, i, np.int16), 0.0)) for i in range(rate)]
+        for name, rate in (("/left/tactile", 100), ("/right/tactile", 50))
+    }
+    _, other = floats(store2, 5)
+    path = bags.write(tmp_path / "b", store2, {**hands, "/skin": other}, form="db3")
+    with pytest.raises(FieldError, match=r"several topics have a field(?s:.*)such as topic='/left/tactile'") as error:
+        read(path, preset="biotac")
+    assert "100 Hz" in str(error.value) and "50 Hz" in str(error.value) and "/skin" not in str(error.value)
+    for name, rate in (("/left/tactile", 100), ("/right/tactile", 50)):
+        assert read(path, preset="biotac", topic=name).report.rate == pytest.approx(rate, rel=1e-3)
+    path = bags.write(tmp_path / "rh", store2, {**hands, "/rh/tactile": hands["/left/tactile"]}, form="db3")
+    recording = read(path, preset="biotac")
+    assert recording.topic == "/rh/tactile"
+    assert recording.report.notes == ("/left/tactile has such readings, too", "/right/tactile has such readings, too")
+
+
+@pytest.mark.parametrize(("bits", "step", "unit"), [(16, 10, "ms"), (16, 10_000, "us"), (32, 10_000_000, "ns")])
+def test_a_devices_clock_that_turns_over_goes_on(tmp_path, bits, step, unit):
+    messages = [(1, i, b'{"v": [1, 2], "t_%s": %d}' % (unit.encode(), (i * step + 5) % 2**bits)) for i in range(9000)]
+    path = mcap(tmp_path / "m.mcap", [(b"/a", b"json", b"Skin", b"", b"")], messages)
+    recording = read(path, topic="/a", field="v", clock=f"t_{unit}")
+    np.testing.assert_allclose(np.diff(recording.times), 0.01, atol=1e-6)
+    assert (recording.report.backward, recording.report.gaps) == (0, ())
+
+
+def test_a_devices_clock_that_begins_anew_goes_back(tmp_path):
+    counts = [*range(30_000, 50_000, 10), *range(0, 9000, 10)]
+    messages = [(1, i, b'{"v": [1, 2], "t_ms": %d}' % count) for i, count in enumerate(counts)]
+    path = mcap(tmp_path / "m.mcap", [(b"/a", b"json", b"Skin", b"", b"")], messages)
+    assert read(path, topic="/a", field="v", clock="t_ms").report.backward == 1
+
+
+def test_stamps_of_whole_seconds_are_no_clock(tmp_path, store2):
+    messages = [
+        (bags.START + i / 100, bags.biotac(store2, np.full(19, i, np.int16), float(bags.START + i // 100)))
+        for i in range(300)
+    ]
+    path = bags.write(tmp_path / "b", store2, {"/t": messages}, form="db3")
+    report = read(path, preset="biotac").report
+    assert report.clock == "log" and report.rate == pytest.approx(100, rel=1e-3)
+    assert "the header's stamps are whole seconds: times are another clock's" in report.notes
+    assert read(path, preset="biotac", clock="header").report.repeated == 297
+    slow = bags.write(tmp_path / "slow", store2, {"/t": messages[::100]}, form="db3")  # a reading a second
+    assert read(slow, preset="biotac").report.clock == "header"
 
 
 JOINTS = (
@@ -552,7 +799,7 @@ def test_a_definition_in_idl_that_is_refused_is_given_as_msg(tmp_path):
     definition = b"module pkg { module msg { struct Skin { float e[(2)]; }; }; };"
     data = struct.pack("<BBH2f", 0, 1, 0, 1, 2)
     path = mcap(tmp_path / "m.mcap", [(b"/skin", b"cdr", b"pkg/msg/Skin", b"ros2idl", definition)], [(1, 0, data)] * 3)
-    with pytest.raises(RecordingError, match=r"Pass the type's \.msg file in definitions="):
+    with pytest.raises(RecordingError, match=r"give definitions='FOLDER' with the type's \.msg"):
         read(path, topic="/skin", field="e")
     assert re.search(r"has no numbers in it: a definition in IDL has '\('.*definitions=", str(describe(path)))
     both = [(b"/skin", b"cdr", b"pkg/msg/Skin", b"ros2idl", definition), (b"/j", b"json", b"J", b"", b"")]

@@ -54,8 +54,8 @@ StreamFile = Annotated[
 Sources = Annotated[
     list[str],
     Argument(
-        help="Recordings, or folders of them: .npy, .csv, .bag, .db3, .mcap, .h5, .zarr, LeRobot data sets, "
-        "and addresses such as s3://…",
+        help="Recordings, or folders of them: .npy, .npz, .mat, .csv, .parquet, .bag, .db3, .mcap, .h5, .zarr, LeRobot "
+        "data sets, and addresses such as s3://…",
         show_default=False,
     ),
 ]
@@ -94,6 +94,9 @@ class Reading:
     field: Annotated[str | None, Option(help="The path to the numbers, such as 'tactiles[0].electrodes'.")] = None
     clock: Annotated[str | None, Option(help="device, header, publish or log; or a field, column or array.")] = None
     columns: Columns = None
+    definitions: Annotated[
+        Path | None, Option(help="A folder of .msg files, for a bag that does not define its messages.")
+    ] = None
 
 
 @dataclass(frozen=True)
@@ -105,9 +108,10 @@ class Timed(Reading):
     def taken(self, **more: Any) -> SourceOptions:
         """How these recordings are read. Raises InputError for options that do not fit together."""
         from scroll_tactile.clients.learning.sources import SourceOptions
+        from scroll_tactile.recordings.decoding import definitions_of
 
         given = {name: getattr(value, "value", value) for name, value in vars(self).items() if value is not None}
-        return SourceOptions(**{**given, **more})
+        return SourceOptions(**{**given, "definitions": definitions_of(self.definitions), **more})
 
 
 @dataclass(frozen=True)
@@ -119,7 +123,8 @@ class Named(Timed):
         str | None,
         Option(
             "--label-by",
-            help="What names each touch: file, folder, topic or task; or folder:2, the second below the one typed.",
+            help="What names each touch: file, folder, topic or task; folder:2, the second below the one typed; or "
+            "group:2, the second part of the path of its array, where --field is a pattern such as 'run/*/tactile'.",
         ),
     ] = None
     intervals: Annotated[

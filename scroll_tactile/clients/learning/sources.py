@@ -42,7 +42,7 @@ __all__ = [
     "stored_source",
 ]
 
-RECORDINGS = (".bag", ".db3", ".mcap", ".npy", ".csv", ".h5", ".hdf5", ".parquet")
+RECORDINGS = (".bag", ".db3", ".mcap", ".npy", ".npz", ".mat", ".csv", ".h5", ".hdf5", ".parquet", ".feather")
 PACKED = (".part",)  # what is looked for in a remote folder: the names that packed memories have
 _LOOKED = 3  # sources are looked at for the names of columns
 WHOLE = ("metadata.yaml", "meta/info.json", ".zgroup", "zarr.json")  # in a folder that is one recording
@@ -57,8 +57,8 @@ _BY = ("topic", "file", "folder", "task")
 class SourceOptions:
     """How sources are read, cut into touches, and named.
 
-    topic, field, clock, columns, preset, labels, annotate: as of `recordings.read`. cut: None cuts by the intervals
-    where there are some, by episodes where a recording has some, and not otherwise.
+    topic, field, clock, columns, definitions, preset, labels, annotate: as of `recordings.read`. cut: None cuts by the
+    intervals where there are some, by episodes where a recording has some, and not otherwise.
     material: the name of all touches. by: what names each touch, as of `recordings.touches`, or "folder:2", the second
     folder below one of `tops`, see `among`. intervals: the table's. At most one of the three names them; without any,
     episodes name themselves. quantities: that are declared before anything is learned, as the table's headings do
@@ -78,6 +78,7 @@ class SourceOptions:
     field: str | None = None
     clock: str | None = None
     columns: str | None = None
+    definitions: Mapping[str, str] | Path | None = None
     preset: str | None = None
     labels: str | None = None
     annotate: Sequence[str] = ()
@@ -97,10 +98,9 @@ class SourceOptions:
                 "touches can be named in one way: by one of material=, by= and intervals=",
                 argument="material by intervals",
             )
-        if self.by is not None and self.by not in _BY and _FOLDER.fullmatch(self.by) is None:
-            raise InputError(
-                f"expected by={', '.join(map(repr, _BY))} or 'folder:2'; came {self.by!r:.60}", argument="by"
-            )
+        if self.by is not None and self.by not in _BY and re.fullmatch(r"(folder|group):\d{1,4}", self.by) is None:
+            expected = ", ".join(map(repr, _BY))
+            raise InputError(f"expected by={expected}, 'folder:2' or 'group:2'; came {self.by!r:.60}", argument="by")
         if self.material is not None:
             require_name(self.material)
         if self.preset is not None:
@@ -192,6 +192,7 @@ class SourceOptions:
             field=self.field,
             clock=self.clock,
             columns=self.columns,
+            definitions=self.definitions,
             preset=self.preset,
             rate=sensor.rate,  # where it has no clock
             labels=self.labels,

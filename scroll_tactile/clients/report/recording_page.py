@@ -136,7 +136,8 @@ def learning(
         words += ["--topic", recording.topic]
     if field and (usual is None or recording.topic is None or field != usual.field):
         words += ["--field", field]
-    words += [word for name in ("clock", "columns") if chosen.get(name) for word in (f"--{name}", str(chosen[name]))]
+    options = [name for name in ("clock", "columns", "definitions") if chosen.get(name)]
+    words += [word for name in options for word in (f"--{name}", str(chosen[name]))]
     if whose.preset is None and not name:
         missing[0] += f", which {shlex.join(['scroll-tactile', 'sensor', path, *words[6:]])} > sensor.json guesses"
     if cut.by == "labels":
@@ -185,7 +186,7 @@ def recording_page(
     """
     if sensor is not None and chosen.get("preset") is not None:
         raise InputError("give sensor= or preset=: both say whose readings they are", argument="sensor preset")
-    contents = describe(path)
+    contents = describe(path, definitions=chosen.get("definitions"))
     recording, chosen, why = _read(contents, fspath(path), chosen)
     whose = whose_readings(contents, recording, sensor, chosen.get("preset"))
     seen = _Seen.of(recording, whose.sensor)

@@ -11,7 +11,6 @@ import numpy as np
 import numpy.typing as npt
 import typer
 
-from examples.benchmarks.shift import Shift, quiet_noise, resting_level, shift_of, simulated_shift
 from examples.paper.readers.biotac_slide import load
 from examples.paper.readers.labelled import Recordings
 from examples.paper.runs.options import Json, Seed
@@ -21,6 +20,7 @@ from scroll_tactile.blas import one_thread
 from scroll_tactile.clients.cli.terminal import progress_bar
 from scroll_tactile.live.answers import LiveTouch
 from scroll_tactile.simulation.scene import Scene
+from scroll_tactile.simulation.shift import Shift, quiet_noise, resting_level, shift_of, simulated_shift
 
 __all__ = ["live", "run_shifts"]
 

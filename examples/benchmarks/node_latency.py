@@ -16,7 +16,6 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from examples.benchmarks.shift import simulated_shift
 from examples.paper.runs.options import Json
 from examples.paper.runs.results import show, write
 from scroll_tactile import TactileLearner, sensors
@@ -25,6 +24,7 @@ from scroll_tactile.clients.ros2 import TactileNode
 from scroll_tactile.clients.ros2.inputs import interface, require_rclpy
 from scroll_tactile.errors import InputError
 from scroll_tactile.simulation.scene import Scene
+from scroll_tactile.simulation.shift import simulated_shift
 
 __all__ = ["ros2", "run_node"]
 

@@ -65,7 +65,8 @@ def apply(
     after the last row. Raises CapacityError before anything is added, DamageError for what cannot be.
     """
     changed: list[Changed] | None = []
-    _note(memory, row)
+    with refusing(store.path, row):
+        _note(memory, row)
     if row.kind == Kind.OBSERVE and summed:
         memory.add_exemplar(row)
     elif row.kind == Kind.OBSERVE:

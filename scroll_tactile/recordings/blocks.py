@@ -39,7 +39,7 @@ class Request:
     labels: str | None = None
     header: bool | None = None
     delimiter: str | None = None
-    decimal: str = "."
+    decimal: str | None = None
     likely: str | None = None  # the topic, where several have the field
     definitions: Mapping[str, str] = dataclasses.field(default_factory=dict)
     annotate: tuple[str, ...] = ()
@@ -143,6 +143,11 @@ class Source(ABC):
         self.names: dict[int, str] = {}
         self.paths: dict[int, str] = {}
         self.marks: list[tuple[float, str]] = []
+
+    @classmethod
+    def holds_some(cls, path: Path) -> bool:
+        """Whether a file in a folder is a recording, where its name alone does not say so; `find` asks."""
+        return True
 
     def field(self) -> str:
         """The field that is read, as far as it is known before reading."""

@@ -1,108 +1,80 @@
-"""Tables of text as a source, `.csv` as people have it: any delimiter, a header of names or numbers, missing cells."""
+"""Tables of text as a source, `.csv` as loggers, spreadsheets and robots write them."""
 
 from __future__ import annotations
 
-import csv
 import fnmatch
 import itertools
 import re
-from collections.abc import Iterator
-from datetime import UTC, datetime
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
-from typing import TextIO
 
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.errors import FieldError, RecordingError
-from scroll_tactile.recordings.blocks import Block, Contents, Entry, Request, Source, rows_of
-from scroll_tactile.recordings.bounds import stored_bytes
+from scroll_tactile.errors import FieldError, RecordingError, ScrollTactileError
+from scroll_tactile.recordings.blocks import Block, Contents, Entry, Request, rows_of
 from scroll_tactile.recordings.paths import nearest
+from scroll_tactile.recordings.text import FEWEST, LONGEST, Layout, Text, in_seconds, is_time, moment, number, usual
 
-__all__ = ["LONGEST", "Delimited", "is_missing", "is_number", "is_table", "missing_cells"]
+__all__ = ["LONGEST", "SUFFIXES", "Delimited"]
 
-LONGEST = 1 << 24
-"""Characters in a line; a longer one is no table's."""
+SUFFIXES = (".csv", ".tsv", ".txt", ".dat")
 
-_MISSING = frozenset(("", "nan", "na", "n/a", "null", "none", "-", "?"))
 _MOST_COLUMNS = 1 << 18  # a picture of 320 × 240 in three colours has 230 400
-_SEEN = 200  # lines are looked at to say what a table is
-_TIME = re.compile(
-    r"(?:time(?:[ _]?stamp)?s?|t|stamp|seconds)(?:[ _]*[\[(]?(s|sec|seconds|ms|us|µs|ns)[\])]?)?", re.IGNORECASE
+_SEEN, _SEEN_TEXT = 200, 1 << 20  # lines, and characters of them, are looked at to say what a table is
+_SEPARATED = re.compile(r'"?sep=(.)"?', re.IGNORECASE)
+_COUNTS = frozenset(("", "index", "idx", "unnamed: 0", "frame", "frame_index", "seq", "sequence", "sample", "row"))
+_UNIT = re.compile(
+    r"[\[(].*[\])]|[munµkM]?(?:s|N|V|A|g|m|bar|Pa|Hz|Ω|ohm|N·?m)|hPa|psi|°?[CFK]|sec(?:onds)?|counts?|raw|a\.?u\.?|-|%|"
+    "°|rad|deg|lsb|ticks",
+    re.IGNORECASE,
 )
-_UNITS = {"ms": 1e3, "us": 1e6, "µs": 1e6, "ns": 1e9}
-_NUMBER = re.compile(
-    r"[+-]?(?:\d+(?:\.\d*)?(?:[eE][+-]?\d+)?|\.\d+(?:[eE][+-]?\d+)?|inf(?:inity)?)", re.IGNORECASE | re.ASCII
-)
+_BLANK = dict.fromkeys(("", " ", "NA", "N/A", "#N/A", "null", "None", "-", "-nan(ind)", "\n", "\t"), "nan")
+
+Floats = npt.NDArray[np.float64]
 
 
-def is_table(path: Path) -> bool:
-    """Whether a file's name is that of a table of text."""
-    return path.suffix.lower() in (".csv", ".tsv", ".txt", ".dat")
-
-
-def is_number(cell: str) -> bool:
-    """Whether a cell is a number as every program writes it: no underscores, no digits of other scripts."""
-    return _NUMBER.fullmatch(cell.strip()) is not None
-
-
-def is_missing(cell: str) -> bool:
-    """Whether a cell stands for a value that is missing: empty, NaN, NA, null, none, - or ?."""
-    return cell.strip().lower() in _MISSING
-
-
-def missing_cells(delimiter: str) -> re.Pattern[str]:
-    """What finds the cells of a line that are missing.
-
-    It has one way to read a run of spaces: where nothing could stand between two runs, it would try each place.
-    """
-    mark = re.escape(delimiter)
-    tokens = "|".join(re.escape(token) for token in sorted(filter(None, _MISSING), key=len, reverse=True))
-    space = rf"[^\S{mark}]*"
-    return re.compile(rf"(?:(?<={mark})|^){space}(?:(?:{tokens}){space})?(?={mark}|$)", re.IGNORECASE)
-
-
-class Delimited(Source):
+class Delimited(Text):
     """A table of text; see `Source`.
 
-    A first row is a header where it has text in it, or counts 0, 1, 2 … as pandas does. A first column without a name
-    (or called "index") that counts rows is left out. A column called time, timestamp, t … holds the times.
+    The rows before the numbers name columns where they have as many cells: names, and units below or above them. A
+    header may also count 0, 1, 2 … as that of pandas does. A first column that counts rows and is called so, or has no
+    name, is left out. A column that is called as times are holds the times.
     """
 
     continuous = labels = True
 
     def __init__(self, path: Path, address: str, request: Request) -> None:
         super().__init__(path, address, request)
-        self.budget.add(stored_bytes(path))
-        if request.decimal not in (".", ","):
-            raise RecordingError(
-                f"expected a decimal point or comma, decimal='.' or ','; came {request.decimal!r}", argument="decimal"
-            )
-        self.comment = ""
-        with self._text() as file:
-            lines = list(itertools.islice(self._lines(file), _SEEN))
-        if not lines:
+        head, delimiter = self._head(), request.delimiter
+        if head and (said := _SEPARATED.fullmatch(head[0][1].strip())):
+            delimiter = request.delimiter or said[1]
+            head.pop(0)
+        if not head:
             raise RecordingError(f"expected readings in {address}, one row each; there are none")
-        self.delimiter = request.delimiter or _delimiter([line for _, line in lines], request.decimal)
-        rows = [(number, self._cells(line, number)) for number, line in lines]
-        self.width = len(rows[0][1])
+        lines = [line for _, line in head if not line.startswith(("#", "%"))] or [line for _, line in head]
+        self.layout = Layout.of(lines, delimiter, request.decimal)
+        rows = [(row, line, self.layout.cells(line)) for row, line in head]
+        self.width = usual([self.layout.cells(line) for line in lines])
         if self.width > _MOST_COLUMNS:
             raise RecordingError(f"{address} has {self.width} columns; expected at most {_MOST_COLUMNS}")
-        self._empty = missing_cells(self.delimiter)
-        self.header = self._header(rows)
-        names = rows[0][1] if self.header else [str(i) for i in range(self.width)]
-        if not self.header and self.comment and len(self.comment.split()) == self.width:
-            names = self.comment.split()
-        self.columns = [name.strip() for name in names]
-        data = [cells for _, cells in rows[1 if self.header else 0 :] if len(cells) == self.width]
-        self.time = self._time_column()
-        self.index = self._index_column(data)
-        self.label = None if request.labels is None else self._column(request.labels)
-        self.chosen = self._chosen()
+        self.episode, self.said = 0, ""
+        self._understand(rows)
+
+    @classmethod
+    def holds_some(cls, path: Path) -> bool:
+        """Whether it is a table of numbers, where it may be any text by its name."""
+        if path.suffix.lower() in SUFFIXES[:2]:
+            return True
+        with suppress(ScrollTactileError, StopIteration, OSError):
+            table = cls(path, str(path), Request())
+            return table.numbers == table.chosen and len(next(table.blocks()).readings) >= FEWEST
+        return False
 
     def field(self) -> str:
         """The columns that are read."""
-        return self.request.field or ",".join(self.columns[i] for i in self.chosen)
+        return ",".join(self.columns[i] for i in self.chosen)
 
     def contents(self) -> Contents:
         """The columns as one entry."""
@@ -111,143 +83,211 @@ class Delimited(Source):
     def blocks(self) -> Iterator[Block]:
         """The rows, a number of them at a time."""
         most = rows_of(8 * self.width)
-        episode, label = 0, None
-        with self._text() as file:
-            lines = itertools.islice(self._lines(file), int(self.header), None)
-            while batch := list(itertools.islice(lines, most)):
-                block, episode, label = self._block(batch, episode, label)
-                yield block
+        lines = ((row, line) for row, line in self.lines() if row >= self.begin)
+        last = None  # is given when all are read, and what was odd is known
+        while batch := list(itertools.islice(lines, most)):
+            block = self._block(batch)
+            self.require_few()
+            if len(block.readings):
+                if last is not None:
+                    yield last
+                last = block
+        self.finish()
+        if last is not None:
+            yield last
 
-    def _block(self, batch: list[tuple[int, str]], episode: int, label: str | None) -> tuple[Block, int, str | None]:
-        table = self._fast([line for _, line in batch])
-        times: npt.NDArray[np.float64] | None = None
-        episodes = None
+    def _block(self, batch: list[tuple[int, str]]) -> Block:
+        rows: list[tuple[int, list[str]]] = []
+        if (table := self._whole(batch)) is None:
+            rows = [(row, self.layout.cells(line)) for row, line in batch]
+            rows = [each for each, (_, line) in zip(rows, batch, strict=True) if self._fits(*each, line)]
+            table = self._flat(rows)
         if table is None:
-            rows = [self._row(line, number) for number, line in batch]
-            table = np.array([[self._value(cells[i], number, i) for i in self.chosen] for number, cells in rows])
-            if self.time is not None:
-                times = np.array([self._time_of(cells[self.time], number) for number, cells in rows])
-            if self.label is not None:
-                numbers = []
-                for _, cells in rows:
-                    name = cells[self.label].strip()
-                    if name != label:
-                        episode, label = episode + 1, name
-                        if name:
-                            self.names[episode] = name
-                    numbers.append(episode)
-                episodes = np.array(numbers, np.int64)
-        elif self.time is not None:
-            times, table = table[:, -1], table[:, :-1]
-        clocks = {} if times is None or self.time is None else {self.columns[self.time]: self._in_seconds(times)}
-        return Block(table, clocks, {}, episodes), episode, label
+            found = [self._values(row, cells) for row, cells in rows]
+            rows = [each for each, values in zip(rows, found, strict=True) if values is not None]
+            table = np.array([values for values in found if values is not None], np.float64)
+        table, clocks = table.reshape(-1, len(self.wanted)), {}
+        if self.time is not None:
+            name, unit = self.columns[self.time], self.units[self.time]
+            clocks, table = {name: in_seconds(table[:, -1], name, unit)}, table[:, :-1]
+        self.empty += int(np.isnan(table).all(axis=1).sum())
+        return Block(table, clocks, {}, self._episodes([cells for _, cells in rows]))
 
-    def _fast(self, lines: list[str]) -> npt.NDArray[np.float64] | None:
-        """All numbers at once, by numpy's parser; None where a row needs a closer look."""
-        if (
-            self.label is not None
-            or self.delimiter == '"'
-            or len(self.delimiter) != 1
-            or (self.delimiter != " " and any(line.count(self.delimiter) != self.width - 1 for line in lines))
-        ):
+    def _whole(self, batch: list[tuple[int, str]]) -> Floats | None:
+        """All numbers by numpy's parser, the fastest; None where a row needs a closer look."""
+        mark = self.layout.delimiter
+        if self.label is not None or self.unended or self.layout.decimal == ",":
             return None
-        if self.request.decimal == ",":
-            lines = [line.replace(",", ".") for line in lines]
-        columns = self.chosen + ([] if self.time is None else [self.time])
-        try:
-            if self.delimiter == " ":
-                whole = np.loadtxt(lines, comments=None, ndmin=2)
-                return whole[:, columns] if whole.shape[1] == self.width else None
-            lines = [self._empty.sub("nan", line) for line in lines]  # numpy's parser refuses what is missing
-            return np.loadtxt(lines, delimiter=self.delimiter, comments=None, ndmin=2, usecols=columns)
-        except ValueError:
+        with suppress(ValueError):
+            lines = [line for _, line in batch]
+            table = np.loadtxt(lines, delimiter=None if mark == " " else mark, comments=None, ndmin=2)
+            if table.shape[1] == self.width:
+                self.seen += len(table)
+                return table[:, self.wanted]
+        return None
+
+    def _flat(self, rows: list[tuple[int, list[str]]]) -> Floats | None:
+        """The numbers where all cells are such, or missing as most programs write it; None otherwise."""
+        flat = [_BLANK.get(cells[i], cells[i]) for _, cells in rows for i in self.wanted]
+        text, comma = "".join(flat), self.layout.decimal == ","
+        if "_" in text or not text.isascii() or self.unended or (comma and "." in text):
+            return None  # float takes 1_000, and digits of all scripts; a point may stand before thousands
+        with suppress(ValueError):
+            flat = [cell.replace(",", ".") for cell in flat] if comma else flat
+            return np.fromiter(map(float, flat), np.float64, len(flat))
+        return None
+
+    def _fits(self, row: int, cells: list[str], line: str) -> bool:
+        """Whether a row has the table's number of cells, or a delimiter more; others are comments, or left out."""
+        comment = line.startswith(("#", "%")) and len(cells) != self.width
+        self.seen += not comment
+        if len(cells) == self.width or (len(cells) == self.width + 1 and not cells[-1].strip()):
+            return True
+        if not comment:
+            self._leave(row, f": expected {self.width} cells as the others have; came {len(cells)}")
+        return False
+
+    def _episodes(self, rows: list[list[str]]) -> npt.NDArray[np.int64] | None:
+        """The number of the episode of each row, which changes with the label."""
+        if self.label is None:
             return None
+        numbers = []
+        for cells in rows:
+            name = self.named(cells[self.label])
+            if name != self.said or not self.episode:
+                self.episode, self.said = self.episode + 1, name
+                self.names |= {self.episode: name} if name else {}
+            numbers.append(self.episode)
+        return np.array(numbers, np.int64)
 
-    def _row(self, line: str, number: int) -> tuple[int, list[str]]:
-        cells = self._cells(line, number)
-        if len(cells) != self.width:
-            raise RecordingError(
-                f"{self.address}, row {number}: expected {self.width} cells as in the rows before it; came {len(cells)}"
-            )
-        return number, cells
-
-    def _value(self, cell: str, number: int, column: int) -> float:
-        if is_missing(cell):
-            return float("nan")
-        text = cell.replace(",", ".") if self.request.decimal == "," else cell
-        if is_number(text):
-            return float(text)
-        hint, argument = "", None
-        if self.request.decimal == "." and is_number(cell.replace(",", ".")):
-            hint, argument = ". For numbers with a decimal comma pass decimal=','", "decimal"
-        elif self.request.field is None:
-            hint = ". Name the columns with numbers by field='first:last', or the column of labels by labels="
+    def _values(self, row: int, cells: list[str]) -> list[float | None] | None:
+        """The numbers of a row, its time last; None where there is text in their place."""
+        if row == self.unended and self._is_half(cells[self.width - 1]):
+            self._leave(row, ": it has no end")
+            return None
+        found = [number(cells[i], self.layout.decimal) for i in self.chosen]
+        if self.time is not None:
+            found.append(moment(cells[self.time], self.layout.decimal))
+        if None not in found:
+            return found
+        place, hint, argument = self.wanted[found.index(None)], "", ""
+        if self.request.field is None and self.numbers and place not in (*self.numbers, self.time):
+            names = [self.columns[i] for i in self.numbers]
+            beside = self.numbers[-1] - self.numbers[0] + 1 == len(names) > 1
+            field = f"{names[0]}:{names[-1]}" if beside else ",".join(names)
+            hint = f". Name the columns with numbers by field={field!r:.200}, or the column of labels by labels="
             argument = "field labels"
-        raise RecordingError(
-            f"{self.address}, row {number}, column {column + 1} ({self.columns[column]}): expected a number; "
-            f"came {cell!r:.60}{hint}",
-            argument=argument,
-        )
+        what = f"expected a number; came {cells[place].strip()!r:.60}{hint}"
+        self._leave(row, f", column {place + 1} ({self.columns[place]}): {what}", argument or None)
+        return None
 
-    def _time_of(self, cell: str, number: int) -> float:
-        if is_number(cell) or is_missing(cell) or self.time is None:
-            return self._value(cell, number, self.time or 0)
-        try:
-            moment = datetime.fromisoformat(cell.strip())
-        except ValueError:
-            return self._value(cell, number, self.time)
-        return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
+    def _is_half(self, cell: str) -> bool:
+        """Whether the last cell of a line without an end is cut: empty, a sign, or of fewer decimals than others."""
+        return cell.strip() in ("", "-", "+") or len(cell.strip().partition(self.layout.decimal)[2]) < self.tail
 
-    def _in_seconds(self, times: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        """By the unit in the column's name, or as milli-, micro- or nanoseconds since 1970 by their size."""
-        match = _TIME.fullmatch(self.columns[self.time or 0])
-        if match and match[1]:
-            return times / _UNITS.get(match[1].lower(), 1.0)
-        largest = float(np.nanmax(np.abs(times), initial=0.0))
-        return times / next((factor for size, factor in ((1e17, 1e9), (1e14, 1e6), (1e11, 1e3)) if largest > size), 1.0)
+    def _leave(self, row: int, what: str, argument: str | None = None) -> None:
+        self.leave_out(row, RecordingError(f"{self.address}, row {row}{what}", argument=argument))
 
-    def _header(self, rows: list[tuple[int, list[str]]]) -> bool:
-        if self.request.header is not None:
-            return self.request.header
-        first = rows[0][1]
-        text = [cell for cell in first if not is_number(cell) and not is_missing(cell)]
-        odd = [cell for cell in text if self.request.decimal == "." and is_number(cell.replace(",", "."))]
-        numbers = [cell.strip() for cell in first if is_number(cell)]
-        counted = numbers == [str(i) for i in range(len(numbers))]
-        if not odd and not counted and len(text) < len(numbers):
-            odd = text
-        if odd:
-            self.columns = [str(i) for i in range(self.width)]
-            self._value(odd[0], rows[0][0], first.index(odd[0]))  # says what is wrong with it
-        if text or not numbers or not counted:
-            return bool(text)
-        # One or two cells may be a reading of 0 and 1: there the rows below have to look otherwise.
-        below = rows[1][1] if len(rows) > 1 else []
-        return len(numbers) >= 3 or not first[0].strip() or any("." in cell for cell in below)
+    def _head(self) -> list[tuple[int, str]]:
+        """The first lines, a name of several lines in quotation marks as one."""
+        head: list[tuple[int, str]] = []
+        size, open_ = 0, False
+        for row, line in self.lines():
+            if open_:
+                head[-1] = (row, f"{head[-1][1]}\n{line}")
+            elif (size > _SEEN_TEXT and len(head) > 3) or len(head) == _SEEN:
+                break
+            else:
+                head.append((row, line))
+            size += len(line)
+            open_ ^= line.count('"') % 2 == 1
+        return head
 
-    def _time_column(self) -> int | None:
-        clock = self.request.clock
-        if clock is not None:
-            return self._column(clock)
-        names = self.columns if self.header or self.comment else []
-        return next((i for i, name in enumerate(names) if _TIME.fullmatch(name)), None)
+    def _understand(self, rows: list[tuple[int, str, list[str]]]) -> None:
+        """What the first rows are: names and units of columns, and from which row on there are numbers."""
+        point, header = self.layout.decimal, self.request.header
+        same = [cells for _, _, cells in rows if len(cells) == self.width]
+        if self.layout.delimiter != " " and self.width > 1 and not any(cells[-1].strip() for cells in same):
+            self.width -= 1  # a delimiter stands behind each row
+        sure = same[2 * len(same) // 3 :][-max(3, _MOST_COLUMNS // self.width) :]
+        numeric = [2 * sum(number(c[i], point) is not None for c in sure) > len(sure) for i in range(self.width)]
+        above: list[list[str]] = []
+        for self.begin, line, cells in rows:
+            if line.startswith(("#", "%")) and len(cells) != self.width:
+                cells = self.layout.cells(line.lstrip("#% "))  # noqa: PLW2901
+            elif (above and not any(numeric)) or not (
+                self._heads(cells, numeric) if header is None else header and not above
+            ):
+                break
+            above.append(cells)
+        else:
+            self.begin += 1
+        data = [cells for row, _, cells in rows if row >= self.begin and self.width <= len(cells) <= self.width + 1]
+        named = [
+            cells for cells in above if len(cells) == self.width or (len(cells) == self.width + 1 and not cells[-1])
+        ]
+        if header is None and not named and data and self._counts(data):
+            named, self.begin = [data.pop(0)], self.begin + 1
+        units = next((cells for cells in named if len(named) > 1 and _are_units(cells)), None)
+        names = next((cells for cells in reversed(named) if cells is not units), None)
+        self.header = names is not None
+        self.units = (units or [""] * self.width)[: self.width]
+        self.columns = [self.named(name) for name in (names or map(str, range(self.width)))][: self.width]
+        self.columns[0] = self.columns[0].lstrip("#% ")
+        if odd := len(above) - len(named):
+            self.notes.append(f"{odd} rows above the numbers name no column")
+        self._assign(data, numeric)
 
-    def _index_column(self, data: list[list[str]]) -> int | None:
-        """The first column, where it has no name and counts the rows from 0 or 1."""
-        if not self.header or self.columns[0].lower() not in ("", "index", "unnamed: 0") or not data:
-            return None
-        cells = [cells[0].strip() for cells in data]
-        return 0 if any(cells == [str(i + first) for i in range(len(cells))] for first in (0, 1)) else None
+    def _assign(self, data: list[list[str]], numeric: list[bool]) -> None:
+        """Which columns are times, labels and readings, by the first rows of numbers; others are left out."""
+        own = data[:-1] if self.unended else data
+        last = [cells[self.width - 1].strip() for cells in own] if len(own) > FEWEST else [""]
+        self.tail = usual([cell.partition(self.layout.decimal)[2] for cell in last])  # decimals of the last column
+        self.time = None if self.request.clock is None else self._column(self.request.clock)
+        apart = []
+        for i, name in enumerate(self.columns if self.header else []):
+            if name.lower() == "date":
+                apart.append(i)
+            elif is_time(name):
+                told = sum(moment(cells[i], self.layout.decimal) is not None for cells in own)
+                if self.time is None and 2 * told >= len(own):
+                    self.time = i
+                else:
+                    apart.append(i)
+            elif re.split("[./]", name.lower())[-1] in _COUNTS and _count(cells[i] for cells in own):
+                apart.append(i)
+        self.label = None if self.request.labels is None else self._column(self.request.labels)
+        if said := [name for i in apart if (name := self.columns[i]) not in ("", "index", "Unnamed: 0")]:
+            self.notes.append(f"left out, as they count or are further times: {', '.join(said)}")
+        rest = [i for i in range(self.width) if i not in (self.time, self.label, *apart)]
+        self.numbers = [i for i in rest if numeric[i]]
+        self.chosen = self._chosen(rest)
+        self.wanted = self.chosen if self.time is None else [*self.chosen, self.time]
+
+    def _heads(self, cells: list[str], numeric: list[bool]) -> bool:
+        """Whether a row stands above the numbers: it has text in their place, in as many cells as it has numbers."""
+        point = self.layout.decimal
+        own = [c for i, c in enumerate(cells) if i >= self.width or numeric[i] or not any(numeric)]
+        numbers = [c.strip() for c in own if number(c, point) is not None and c.strip()]
+        text = sum(number(c, point) is None for c in own)
+        return text > 0 and (text >= len(numbers) or numbers == [str(i) for i in range(len(numbers))])
+
+    def _counts(self, data: list[list[str]]) -> bool:
+        """Whether the first row counts 0, 1, 2 …: one or two cells may be a reading that looks as those below."""
+        numbers = [cell.strip() for cell in data[0] if cell.strip()]
+        counted = bool(numbers) and numbers == [str(i) for i in range(len(numbers))]
+        unlike = not data[0][0].strip() or any("." in cell for cell in (data[1] if len(data) > 1 else []))
+        return counted and (len(numbers) >= 3 or unlike)
 
     def _column(self, name: str) -> int:
-        if name in self.columns:
-            return self.columns.index(name)
+        for each in (name, name.lstrip("#% "), self.named(name)):
+            if each in self.columns:
+                return self.columns.index(each)
         if re.fullmatch(r"\d{1,6}", name) and int(name) < self.width and not self.header:
             return int(name)
         raise FieldError(f"{self.address} has no column {name!r}{nearest(name, self.columns)}")
 
-    def _chosen(self) -> list[int]:
-        rest = [i for i in range(self.width) if i not in (self.time, self.index, self.label)]
+    def _chosen(self, rest: list[int]) -> list[int]:
         if self.request.field is None:
             if not rest:
                 raise RecordingError(f"{self.address} has no column of numbers besides its times, index and labels")
@@ -269,39 +309,14 @@ class Delimited(Source):
             )
         return chosen
 
-    def _cells(self, line: str, number: int) -> list[str]:
-        if self.delimiter == " ":
-            return line.split()
-        try:
-            return next(csv.reader([line], delimiter=self.delimiter, skipinitialspace=True))
-        except (csv.Error, StopIteration, TypeError) as error:
-            raise RecordingError(
-                f"{self.address}, row {number}, cannot be read as a table: {error}. Is a quotation mark never closed?"
-            ) from error
 
-    def _text(self) -> TextIO:
-        return self.path.open(encoding="utf-8-sig", newline=None)
-
-    def _lines(self, file: TextIO) -> Iterator[tuple[int, str]]:
-        number = 0
-        while line := file.readline(LONGEST):
-            number += 1
-            if len(line) == LONGEST:
-                raise RecordingError(f"{self.address}, row {number}, is longer than any table's; is it another file?")
-            if line.startswith("#"):
-                self.comment = line.lstrip("#").strip()
-            elif line.strip():
-                yield number, line
+def _count(cells: Iterable[str]) -> bool:
+    """Whether each cell is one more than that before."""
+    found = [cell.strip() for cell in cells]
+    return bool(found) and found[0].isdigit() and found == [str(int(found[0]) + i) for i in range(len(found))]
 
 
-def _delimiter(lines: list[str], decimal: str) -> str:
-    """What separates cells: the first of ; tab | , and space that splits all lines alike."""
-    for mark in (";", "\t", "|", ",", " "):
-        if mark == "," and decimal == ",":
-            continue
-        counts = {len(line.split()) if mark == " " else line.strip("\n").count(mark) + 1 for line in lines[:_SEEN]}
-        if len(counts) == 1 and counts != {1}:
-            return mark
-    marks = {mark: sum(mark in line for line in lines) for mark in ";\t|,"}
-    best = max(marks, key=lambda mark: marks[mark])
-    return best if marks[best] else ","
+def _are_units(cells: list[str]) -> bool:
+    """Whether all cells are units of measurement, in brackets or known ones."""
+    texts = [cell.strip() for cell in cells if cell.strip()]
+    return bool(texts) and all(map(_UNIT.fullmatch, texts))

@@ -49,15 +49,15 @@ def read(
     resample: float | None = None,
     header: bool | None = None,
     delimiter: str | None = None,
-    decimal: str = ".",
+    decimal: str | None = None,
     definitions: _Definitions = None,
 ) -> Recording:
     """All readings of a file, or of a folder that is one recording.
 
     path: a ROS 1 `.bag`; a ROS 2 `.db3` or `.mcap`, or the folder of a bag; a LeRobotDataset v2 or v3; `.parquet`
-        and `.feather`; HDF5, as robomimic's; a Zarr replay buffer; `.npy`, `.npz` and `.mat`; `.csv`. Bags in a folder
-        whose names differ in a last number alone are one that was split. On this machine, or an address that fsspec
-        knows.
+        and `.feather`; HDF5, as robomimic's; a Zarr replay buffer; `.npy`, `.npz` and `.mat`; a table of text, `.csv`;
+        `.json` and `.jsonl`. Bags in a folder whose names differ in a last number alone are one that was split. On this
+        machine, or an address that fsspec knows.
     topic, field: where the numbers are. Of messages `field` is a path such as `tactiles[0].electrodes`, see `paths`; of
         tables it names columns (`e1:e19`, `e*`, `a,b`), of others an array, with an index behind it (`[0:19]`); arrays
         that a pattern finds in several groups (`run/*/tactile`), and entries of a stack (`x[*]`), are episodes, see
@@ -115,7 +115,7 @@ def iterate(
     labels: str | None = None,
     header: bool | None = None,
     delimiter: str | None = None,
-    decimal: str = ".",
+    decimal: str | None = None,
     definitions: _Definitions = None,
 ) -> Iterator[Recording]:
     """The readings of a file block by block, as recordings of at most 4096 readings: for files beyond memory.
@@ -155,8 +155,8 @@ def describe(path: _Address, *, definitions: _Definitions = None) -> Contents:
 def find(path: _Address) -> list[Path]:
     """The recordings in a local folder and the folders inside it, in the order of their names.
 
-    A file is a recording by its suffix (`.txt` and `.dat` only where they are named themselves), and so is a folder
-    that says it is one, as a ROS 2 bag does by its metadata.yaml. Bags beside each other are recordings of their own,
+    A file is a recording by its suffix (`.txt`, `.dat` and `.json` where they hold readings), and so is a folder that
+    says it is one, as a ROS 2 bag does by its metadata.yaml. Bags beside each other are recordings of their own,
     however they are numbered; `read` takes their folder as one that was split. Raises RecordingError for a path where
     nothing is.
     """
@@ -178,7 +178,7 @@ def _found(place: Path, depth: int) -> list[Path]:
             continue  # it may lead back here
         if inside.is_dir() and not inside.name.startswith("."):
             found += _found(inside, depth + 1) if depth < _DEEPEST else []
-        elif inside.suffix.lower() not in (".txt", ".dat") and _kind(inside) is not None:
+        elif (kind := _kind(inside)) is not None and kind.holds_some(inside):
             found.append(inside)
     return found
 
@@ -216,7 +216,7 @@ def _open(path: Path, address: str, request: Request, preset: str | None = None)
 
 
 def _kind(path: Path) -> type[Source] | None:
-    from scroll_tactile.recordings import arraystores, columnar, delimited, rosbag, zarrfile
+    from scroll_tactile.recordings import arraystores, columnar, delimited, jsonfile, rosbag, zarrfile
 
     if rosbag.is_rosbag(path):
         return rosbag.RosBag
@@ -225,11 +225,16 @@ def _kind(path: Path) -> type[Source] | None:
     if zarrfile.is_zarr(path):
         return zarrfile.ZarrBuffer
     suffix = "" if path.is_dir() else path.suffix.lower()
-    if suffix and delimited.is_table(path):
-        return delimited.Delimited
-    kinds: dict[str, type[Source]] = {".npy": arraystores.Npy, ".npz": arraystores.Npz, ".mat": arraystores.Mat}
-    kinds |= dict.fromkeys((".h5", ".hdf5", ".hdf"), arraystores.Hdf5)
-    return (kinds | dict.fromkeys((".parquet", ".feather"), columnar.Columnar)).get(suffix)
+    readers: dict[type[Source], tuple[str, ...]] = {
+        arraystores.Hdf5: (".h5", ".hdf5", ".hdf"),
+        arraystores.Npy: (".npy",),
+        arraystores.Npz: (".npz",),
+        arraystores.Mat: (".mat",),
+        columnar.Columnar: (".parquet", ".feather"),
+        delimited.Delimited: delimited.SUFFIXES,
+        jsonfile.JsonFile: jsonfile.SUFFIXES,
+    }
+    return next((reader for reader, suffixes in readers.items() if suffix in suffixes), None)
 
 
 def _timed(source: Source, request: Request) -> Iterator[Block]:

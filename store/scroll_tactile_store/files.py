@@ -179,12 +179,12 @@ def dense_size(descriptor: int, path: Path) -> int:
 
 
 def store_folder(path: str | os.PathLike[str]) -> Path:
-    """Return the absolute path of a folder; raise NotAStoreError for what no file system could call so."""
+    """Return the absolute path of a folder, `~` its home; raise NotAStoreError for what no file system calls so."""
     try:
-        folder = Path(path).absolute()
+        folder = Path(path).expanduser().absolute()
         if b"\0" not in os.fsencode(folder):
             return folder
-    except (TypeError, UnicodeEncodeError):
+    except (TypeError, UnicodeEncodeError, RuntimeError):  # the last where nobody has this home
         pass
     raise NotAStoreError(f"expected the path of a folder; came {path!r}, which is none")
 

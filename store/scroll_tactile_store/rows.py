@@ -139,7 +139,7 @@ class Rows:
                     self._take(log, frame)
         if self.last < last:
             what = f"{log.path} ends with row {self.last}, and had row {last}: its end is damaged or was cut off"
-            refuse(DamageError(what, path=log.path), [])
+            raise DamageError(f"{what}: repair the store (repair_store)", path=log.path)
 
     def _take(self, log: Log, frame: Frame) -> None:
         data = log.read(frame.offset, frame.size, first=HEAD_BYTES + 8)
@@ -148,8 +148,8 @@ class Rows:
             if self.sequences and sequence <= self.sequences[-1]:
                 raise ValueError(f"row {sequence} follows row {self.sequences[-1]}")
         except ValueError as error:
-            what = f"{log.path} has a frame that is no row (byte {frame.offset}): {error}"
-            refuse(DamageError(what, path=log.path, offset=frame.offset), [])
+            what = f"{log.path} has a frame that is no row (byte {frame.offset}): {error}: repair the store"
+            raise DamageError(f"{what} (repair_store)", path=log.path, offset=frame.offset) from error
         self.append(
             sequence, frame.offset, frame.size, data[HEAD_BYTES : HEAD_BYTES + min(8, FIELDS.unpack_from(data)[4])]
         )

@@ -27,7 +27,6 @@ from scroll_tactile_store.layout import (
     log_path,
     numbers,
     read_current,
-    require_safe,
     unnamed,
 )
 from scroll_tactile_store.log import BEGIN, Log
@@ -72,9 +71,9 @@ def check_store(path: str | PathLike[str], *, progress: Progress | None = None) 
         except DamageError as error:
             return [Problem(folder, str(error), "lost")]
     with reported(folder, "checking the store"):
-        require_store(folder)
         try:
-            require_safe(folder)
+            if not holds_store(folder):
+                raise NotAStoreError(f"{folder} holds no store")
         except DamageError as error:
             return [Problem(error.path, str(error), "lost")]
         for _ in range(ATTEMPTS):
@@ -84,15 +83,6 @@ def check_store(path: str | PathLike[str], *, progress: Progress | None = None) 
             if not found or survey.current == current_of(folder):
                 break
         return found + survey.leftovers()
-
-
-def require_store(folder: Path) -> None:
-    """Return where `folder` holds a store, or what is left of one. Raises NotAStoreError and VersionError."""
-    try:
-        if not holds_store(folder):
-            raise NotAStoreError(f"{folder} holds no store")
-    except DamageError:
-        return
 
 
 def current_of(folder: Path) -> Current | None:
@@ -135,12 +125,11 @@ class Survey:
         except BaseException:
             self.close()
             raise
-        known = [self._known, self._end + self._is_torn, *(each.last_sequence for each in self.sound)]
-        self.last = max(known + ([] if current is None else [each.last_sequence for each in current.checkpoints]))
+        checkpoints = self.sound if current is None else current.checkpoints
+        self.last = max(self._known, self._end + self._is_torn, *(each.last_sequence for each in checkpoints))
         self._note_gap(self.last)
-        self._problems += [
-            Problem(self.path, f"{what} in {self.path}", "lost") for _, what in self.faulty(1, self.last)
-        ]
+        for _, what in self.faulty(1, self.last):
+            self._note(self.path, f"{what} in {self.path}", "lost")
         if self.identity is None:
             self._note(folder, f"nothing in {folder} tells what the store is for", "lost")
 
@@ -176,12 +165,8 @@ class Survey:
         current = self.current
         try:
             log = self.log = Log(self.path, identity=None if current is None else current.log_identity)
-            if current is not None and log.identity != current.log_identity:
-                raise DamageError(f"{self.path} is the log of another store, or of another time", path=self.path)
         except (DamageError, FileNotFoundError) as error:  # nothing of it is read
-            self._note(self.path, error if isinstance(error, DamageError) else f"{self.path} is gone", "lost")
-            self.close()
-            self.log = None
+            self._note(self.path, error, "lost")
             return
         try:
             if log.header_damage is not None:

@@ -14,12 +14,12 @@ from scroll_tactile_store.rows import decode_row
 from examples.benchmarks import appending, health, health_peers, live_shift
 from examples.benchmarks.interleaved import AsIs
 from examples.benchmarks.live_shift import _scored
-from examples.benchmarks.shift import Shift, Truth, quiet_noise, resting_level, shift_of
 from scroll_tactile import sensors
 from scroll_tactile.errors import InputError
 from scroll_tactile.live.answers import LiveTouch
 from scroll_tactile.results import Prediction
 from scroll_tactile.simulation.scene import Scene
+from scroll_tactile.simulation.shift import Shift, Truth, quiet_noise, resting_level, shift_of
 from scroll_tactile.testing import check_embedding
 
 

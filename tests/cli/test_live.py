@@ -11,10 +11,11 @@ from rich.console import Console
 from touches import PAD, SMALL
 from typer.testing import CliRunner
 
-from examples.benchmarks.shift import simulated_shift
 from scroll_tactile import Kernels, TactileLearner, sensors
 from scroll_tactile.clients.cli import everyday
+from scroll_tactile.clients.cli.terminal import Reading
 from scroll_tactile.simulation.scene import Scene
+from scroll_tactile.simulation.shift import simulated_shift
 
 SCENE = Scene(sensors.ROBOSKIN)
 SHIFT = simulated_shift(SCENE, ["silk", "wool"], seconds=22)
@@ -95,9 +96,55 @@ def test_what_cannot_be_replayed_is_one_red_line(memory, monkeypatch):
     assert "(T, 60)" in refused("live", memory / "memory", memory / "narrow.npy")
     monkeypatch.setattr(everyday, "LONGEST_LINE", 400)
     row = b",".join([b"1"] * 60) + b"\n"
-    for line, said in ((b"3,x\n", "line 2"), (b"\xff\xfe,1\n", "xff"), (b"1" * 401, "of less than 400 characters")):
-        done = CliRunner().invoke(APP, ["live", str(memory / "memory"), "-"], input=row + line)
-        assert done.exit_code == 1 and said in done.stderr
+    for line, said in (
+        (b"3,x\n" * 100, "line 1: expected 60 numbers"),
+        (row + b"1" * 401, "of less than 400 characters"),
+    ):
+        done = CliRunner().invoke(APP, ["live", str(memory / "memory"), "-"], input=line)
+        assert done.exit_code == 1 and said in " ".join(done.stderr.split())
+    done = CliRunner().invoke(APP, ["live", str(memory / "memory"), "-"], input=b"0.5," + row)
+    assert done.exit_code == 1 and "If the first is a time, add --timed" in " ".join(done.stderr.split())
+
+
+NUMBERS = np.round(np.random.default_rng(0).normal(size=(150, 4)), 3)
+TIMES = [str(i / 50) for i in range(150)]
+LINES = [",".join(map(str, row)) for row in NUMBERS]
+WRITTEN = {
+    "commas behind": [f"{row}," for row in LINES],
+    "semicolons": [row.replace(",", ";") for row in LINES],
+    "decimal commas": [row.replace(",", ";").replace(".", ",") for row in LINES],
+    "spaces": [row.replace(",", " ") for row in LINES],
+    "tabs and a header": ["a\tb\tc\td", *(row.replace(",", "\t") for row in LINES)],
+    "a header with times": ["time,a,b,c,d", *(f"{time},{row}" for time, row in zip(TIMES, LINES, strict=True))],
+    "times behind": ["a,b,c,d,t [ms]", *(f"{row},{1e3 * float(t)}" for t, row in zip(TIMES, LINES, strict=True))],
+}
+BAD = {
+    "a half first line": [LINES[5][9:], *LINES],
+    "boot text": ["Booting v1.2", *LINES],
+    "a lost byte": [*LINES[:80], LINES[80][:-9], *LINES[80:]],
+    "no text": [*LINES[:80], "\\xff\\xfe,1", *LINES[80:]],
+}
+
+
+@pytest.mark.parametrize("name", [*WRITTEN, *BAD])
+def test_lines_are_read_as_tables_are_and_bad_ones_left_out(monkeypatch, name):
+    monkeypatch.setattr(everyday, "_lines", lambda: (f"{line}\n" for line in {**WRITTEN, **BAD}[name]))
+    lines = everyday.LiveLines(4, timed=False, how=Reading())
+    times, readings = zip(*lines.readings(), strict=True)
+    np.testing.assert_array_equal(readings, NUMBERS)
+    assert times == pytest.approx([i / 50 for i in range(150)]) if "times" in name else set(times) == {None}
+    assert lines.left_out == (name in BAD)
+
+
+def test_a_session_goes_on_behind_a_bad_line_which_is_counted_and_told(memory):
+    rows = [",".join(f"{value:.17g}" for value in row) for row in SHIFT.readings]
+    rows = ["x,x2," + ",".join("abc" * 20), "Booting", *(f"7,8,{row}" for row in rows), "7,8,9"]
+    words = ["live", str(memory / "memory"), "-", "--columns", "2:62", "--json"]
+    done = CliRunner().invoke(APP, words, input="\n".join(rows))
+    report = json.loads(done.stdout.splitlines()[-1])
+    assert done.exit_code == 0
+    assert (report["readings"], report["touches"], report["left_out"]) == (len(rows) - 3, len(SHIFT.touches), 2)
+    assert done.stderr.count("left out:") == 1 and "line 2: columns" in " ".join(done.stderr.split())
 
 
 @pytest.mark.parametrize("option", ["--topic", "--field", "--preset", "--clock"])

@@ -33,7 +33,7 @@ def folder(tmp_path_factory):
         readings = SCENE.touch(name, 0).readings
         np.save(folder / "rec" / name / "0.npy", np.column_stack([np.zeros((len(readings), 25)), readings]))
     np.save(folder / "touch.npy", readings)
-    np.savetxt(folder / "comma.csv", readings[:3], delimiter=";", fmt="%.1f")
+    np.savetxt(folder / "comma.csv", 1 + readings[:3] % 9, delimiter=";", fmt="%.3f")
     text = (folder / "comma.csv").read_text().replace(".", ",")
     (folder / "comma.csv").write_text(text)
     (folder / "table.csv").write_text("file,begin,end,material\noak/0,0,2,oak\nfelt/0,1,3,felt\n")
@@ -192,10 +192,11 @@ def test_a_table_cuts_what_has_no_clock_at_the_sensors_rate(folder, tmp_path, mo
     assert [each["source"] for each in listed] == ["rec/felt/0.npy[100:300] 25:44", "rec/oak/0.npy[0:200] 25:44"]
 
 
-def test_what_no_option_can_do_is_said_to_be_pythons(folder, monkeypatch):
+def test_a_decimal_comma_is_said_by_the_option_that_is_proposed(folder, monkeypatch):
     monkeypatch.chdir(folder)
-    result = run("learn", "new", "comma.csv", "--sensor", "biotac", "--label", "oak")
-    assert "pass decimal=',' (decimal=: from Python alone)" in result.stderr
+    words = ("learn", "new", "comma.csv", "--sensor", "biotac", "--label", "oak")
+    assert "if it is before decimals, pass --decimal ','" in run(*words).stderr
+    assert "before decimals" not in run(*words, "--decimal", ",").stderr
 
 
 def test_probabilities_are_written_with_six_digits():

@@ -5,10 +5,10 @@ import pytest
 from live_touches import learner, shift, slide
 from touches import PAD, SMALL
 
-from examples.benchmarks.shift import simulated_shift
 from scroll_tactile import Sensor, TactileLearner, sensors
 from scroll_tactile.live.detector import ContactDetector, Rest
 from scroll_tactile.simulation.scene import Scene
+from scroll_tactile.simulation.shift import simulated_shift
 
 
 def found(sensor, rows, false_contacts=1.0, size=10_000):

@@ -4,12 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from scroll_tactile.errors import FieldError, InputError, RecordingError
+from scroll_tactile import Sensor
+from scroll_tactile.errors import ChannelCountError, FieldError, InputError, RecordingError
 from scroll_tactile.recordings import describe, iterate, read
-from scroll_tactile.recordings.delimited import is_missing, is_number, missing_cells
+from scroll_tactile.recordings.text import number
 
 
 def table(folder: Path, text: str, name: str = "t.csv") -> Path:
@@ -47,25 +46,47 @@ NAN = float("nan")
         ("a,b,c\n1,,nan\nNA,2,null\n", [[1, NAN, NAN], [NAN, 2, NAN]], None),
         ('"a","b"\n"1","2"\n', [[1, 2]], None),
         ("a,b\n1e3,-.5\n+2.,inf\n", [[1000, -0.5], [2, np.inf]], None),
+        ("sep=;\na;b\n1;2\n", [[1, 2]], None),
+        ("a;b\n1,5;2\n-0,25;1e3\n", [[1.5, 2], [-0.25, 1000]], None),
+        ("1,5 2,5\n3 4\n", [[1.5, 2.5], [3, 4]], None),
+        ("1, 2, 3\n4, 5, 6\n", [[1, 2, 3], [4, 5, 6]], None),
+        ("a,b,\n1,2,\n3,4,\n", [[1, 2], [3, 4]], None),
+        ("a,b\n1,2,\n3,4,\n", [[1, 2], [3, 4]], None),
+        ("1\t2\t\n3\t4\t\n", [[1, 2], [3, 4]], None),
+        ("time,a\nms,N\n500,1\n600,3\n", [[1], [3]], [0.5, 0.6]),
+        ("ms,N\ntime,a\n500,1\n600,3\n", [[1], [3]], [0.5, 0.6]),
+        ("a,b\n[N],[N]\n1,2\n", [[1, 2]], None),
+        ("Device: pad\nRate,100\n\ntime,a,b\n0.5,1,2\n0.6,3,4\n", [[1, 2], [3, 4]], [0.5, 0.6]),
+        ("a,b\n#N/A,2\n-nan(ind),4\n", [[NAN, 2], [NAN, 4]], None),
+        ("# made by hand\n1,2\n# a pause\n3,4\n", [[1, 2], [3, 4]], None),
+        ('"a\nx",b\n1,2\n', [[1, 2]], None),
+        ("frame,a\n7,1\n8,2\n", [[1], [2]], None),
+        ('"1,5","2,5"\n"3","4,25"\n', [[1.5, 2.5], [3, 4.25]], None),
+        ("time,a\n2026/01/01 00:00:00.5,1\n2026-01-01T00:00:01Z,3\n", [[1], [3]], [1767225600.5, 1767225601]),
+        ("__time,a\n0.5,1\n0.6,3\n", [[1], [3]], [0.5, 0.6]),
+        ("Time [s],a\n0.5,1\n0.6,3\n", [[1], [3]], [0.5, 0.6]),
+        ("timestamp_ns,a\n500000000,1\n600000000,3\n", [[1], [3]], [0.5, 0.6]),
+        ("rosbag_timestamp,a\n0.5,1\n0.6,3\n", [[1], [3]], [0.5, 0.6]),
+        ("time,a\n00:01:00.5,1\n00:01:01,3\n", [[1], [3]], [60.5, 61]),
     ],
 )
 def test_tables_in_every_form(tmp_path, text, readings, times):
     recording = read(table(tmp_path, text))
     np.testing.assert_array_equal(recording.readings, readings)
     np.testing.assert_array_equal(recording.times, np.full(len(readings), NAN) if times is None else times)
-    assert recording.report.clock == (None if times is None else text.partition(",")[0])
+    assert recording.report.clock is None if times is None else recording.report.clock in text
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("a,b\n1,2\n3,x\n", r"row 3, column 2 \(b\): expected a number; came 'x'"),
-        ("a,b\n1,2\n\n3\n", "row 4: expected 2 cells as in the rows before it; came 1"),
+        ("a,b\n1,2\n\n3\n", "row 4: expected 2 cells as the others have; came 1"),
         ("1.5,2,x\n1,2,3\n", "row 1, column 3 .*: expected a number; came 'x'"),
         ("a,b\n1_000,2\n", "expected a number; came '1_000'"),
         ("a,b\n٣,2\n", "expected a number"),
-        ("1,5;2,5\n1,5;2,5\n", "row 1, column 1 .*pass decimal=','"),
-        ("a;b\n1,5;2,5\n", "row 2, column 1 .*pass decimal=','"),
+        ("a;b\n1,500;2,125\n", "before thousands: if it is before decimals, pass decimal=','"),
+        ("a;b\n1.234,5;2\n", "row 2, column 1 .*came '1.234,5'"),
         ("a,b\n", "holds no readings"),
         ("", "there are none"),
         ("\n \n", "there are none"),
@@ -78,11 +99,11 @@ def test_what_is_wrong_with_a_table_is_said_where_it_is(tmp_path, text, message)
         read(table(tmp_path, text))
 
 
-def test_a_decimal_comma_is_read_where_it_is_asked_for(tmp_path):
-    path = table(tmp_path, "t;a;b\n0,1;1,5;2\n0,2;2,5;1e3\n")
-    recording = read(path, decimal=",")
-    np.testing.assert_array_equal(recording.readings, [[1.5, 2], [2.5, 1000]])
-    np.testing.assert_array_equal(recording.times, [0.1, 0.2])
+def test_a_decimal_comma_is_read_where_it_is_sure_or_asked_for(tmp_path):
+    path = table(tmp_path, "t;a;b\n0,100;1,500;2\n0,200;2,500;1e3\n")
+    for recording in (read(path), read(path, decimal=",")):
+        np.testing.assert_array_equal(recording.readings, [[1.5, 2], [2.5, 1000]])
+        np.testing.assert_array_equal(recording.times, [0.1, 0.2])
 
 
 def test_columns_are_named_by_lists_ranges_and_patterns(tmp_path):
@@ -130,28 +151,119 @@ def test_the_slow_way_gives_the_same_as_the_fast(tmp_path):
         np.testing.assert_array_equal(read(tmp_path / f"{name}.csv").readings, values)
 
 
-@pytest.mark.parametrize(
-    ("cell", "is_one"),
-    [
-        *((cell, True) for cell in ("1", "1.", ".5", "-1.5e-3", "inf", "1.e5", " 2 ")),
-        *((cell, False) for cell in ("", ".", "1_0", "e5", "1.2.3", "1" * 200_000 + "x")),
-    ],
-    ids=lambda value: str(value)[:12],
-)
-def test_a_cell_is_a_number_or_not_however_long(cell, is_one):
-    assert is_number(cell) is is_one
+def test_a_cell_is_a_number_missing_or_text_however_long():
+    assert [number(cell) for cell in ("1", "1.", ".5", "-1.5e-3", " 2 ", "1.e5")] == [1, 1, 0.5, -0.0015, 2, 1e5]
+    assert [number(cell) for cell in ("inf", "-1.#INF", "1.#INF")] == [np.inf, -np.inf, np.inf]
+    for cell in (
+        "",
+        " ",
+        "nan",
+        "-NaN",
+        "NA",
+        "n/a",
+        "#N/A",
+        "null",
+        "-",
+        "-nan(ind)",
+        "1.#QNAN",
+        "-1.#IND00",
+        "#DIV/0!",
+    ):
+        assert np.isnan(number(cell))
+    for cell in (".", "1_0", "e5", "1.2.3", "1" * 200_000 + "x", "٣", "1,5", "nano", "#"):
+        assert number(cell) is None
+    assert [number(cell, ",") for cell in ("1,5", "2", "1.5", "1.234,5")] == [1.5, 2, None, None]
+
+
+@pytest.mark.parametrize("code", ["utf-8", "utf-8-sig", "latin-1", "utf-16", "utf-16-le", "utf-16-be"])
+def test_every_encoding_is_read_and_a_guess_is_said(tmp_path, code):
+    path = tmp_path / "t.csv"
+    path.write_bytes("Kraft [N],Wärme [°C]\r\n1,2\r\n3,4\r\n".encode(code))
+    recording = read(path)
+    assert recording.readings.tolist() == [[1, 2], [3, 4]]
+    assert recording.field == "Kraft [N],Wärme [°C]"
+    guessed = code in ("latin-1", "utf-16-le", "utf-16-be")
+    assert recording.report.notes == ((f"its encoding is guessed: {code}",) if guessed else ())
+
+
+ROWS = [f"{i / 100:.2f},{i}.5,{2 * i}.25" for i in range(300)]
+
+
+@pytest.mark.parametrize("behind", [b"", b"2.9", b"2.99,299.5,", bytes(5), b"2.9" + bytes(5000), b"2.99,299.5,7"])
+def test_a_table_that_was_cut_off_is_read_to_its_last_whole_row(tmp_path, behind):
+    path = tmp_path / "t.csv"
+    path.write_bytes("\n".join(["time,a,b", *ROWS[:299], ""]).encode() + behind)
+    recording = read(path)
+    assert len(recording) == 299
+    assert recording.report.cut_off == bool(behind)
+    assert len(recording.report.notes) == bool(behind)
+
+
+@pytest.mark.parametrize("row", ["1.2,3", "1.2,3,4,5", "1.2,x,4", "time,a,b", "Booting v1.2"])
+def test_a_row_in_a_hundred_may_be_left_out_and_that_is_said(tmp_path, row):
+    rows = [*ROWS[:80], row, *ROWS[80:]]
+    recording = read(table(tmp_path, "\n".join(["time,a,b", *rows, ""])))
+    assert len(recording) == 300
+    (note,) = recording.report.notes
+    assert note.startswith("1 of 301 rows are left out") and "row 82" in note
+    with pytest.raises(RecordingError, match=r"row 4[,:]"):
+        read(table(tmp_path, "\n".join(["time,a,b", *ROWS[:2], row, *ROWS[2:50], ""])))
+
+
+def test_a_row_of_the_tables_width_is_data_however_it_begins(tmp_path):
+    path = table(tmp_path, "\n".join(["a,b,c", *ROWS[:40], "#N/A,1,2", *ROWS[40:], "# end", "%"]))
+    recording = read(path)
+    assert len(recording) == 301 and np.isnan(recording.readings[40, 0])
+    assert read(table(tmp_path, "a,b\n,\n1,2\n")).report.notes == ("1 rows have no number at all",)
+
+
+def test_further_times_and_counters_are_no_taxels(tmp_path):
+    """As rostopic and bagpy write them."""
+    head = "%time,field.header.seq,field.header.stamp,secs,nsecs,field.data0,field.data1"
+    rows = [f"{10**18 + i * 10**7},{7 + i},{10**18 + i * 10**7},1000000000,{i * 10**7},{i}.5,2" for i in range(30)]
+    recording = read(table(tmp_path, "\n".join([head, *rows, ""])))
+    assert recording.field == "field.data0,field.data1" and recording.report.clock == "time"
+    assert recording.report.rate == pytest.approx(100, rel=1e-3)
+    assert "field.header.seq, field.header.stamp, secs, nsecs" in recording.report.notes[0]
+    recording = read(table(tmp_path, "time,a\n01.02.2026 10:00,1\n01.02.2026 10:01,2\n"))
+    assert recording.readings.tolist() == [[1], [2]] and recording.report.clock is None
+
+
+def test_a_file_that_changes_while_it_is_read_is_said_or_refused(tmp_path):
+    path = table(tmp_path, "\n".join(["time,a,b", *ROWS * 20, ""]))
+    blocks = iterate(path)
+    next(blocks)
+    with path.open("a") as file:
+        file.write("7,8,9\n")
+    assert "it grew while it was read" in list(blocks)[-1].report.notes[-1]
+    blocks = iterate(path)
+    next(blocks)
+    path.write_text("1,2,3\n")
+    with pytest.raises(RecordingError, match="was changed while it was read"):
+        list(blocks)
+
+
+@pytest.mark.parametrize("begin", [b"PK\x03\x04", b"\x1f\x8b\x08"])
+def test_other_files_are_called_what_they_are(tmp_path, begin):
+    (tmp_path / "t.csv").write_bytes(begin + bytes(range(256)))
+    with pytest.raises(RecordingError, match="expected text"):
+        read(tmp_path / "t.csv")
+
+
+@pytest.mark.parametrize("name", ["", "__time,", "%time,", "Time [s],", "Zeit,"])
+def test_what_an_error_proposes_gives_the_touch_and_no_time(tmp_path, name):
+    path = tmp_path / "t.csv"
+    path.write_text((f"{name}a,b,c,d\n" if name else "") + "".join(f"{i / 100},{i % 40}.5,2,3,1\n" for i in range(150)))
+    sensor = Sensor(name="pad", channels=4, rate=100.0, low=0.0, high=200.0, unit="counts", duration=1.0)
+    recording = read(path)
+    if name in ("", "Zeit,"):
+        with pytest.raises(ChannelCountError, match="columns='1:5'"):
+            recording.stream(sensor)
+        recording = read(path, columns="1:5")
+    assert recording.stream(sensor).readings[:, 0].tolist() == [i % 40 + 0.5 for i in range(150)]
 
 
 def test_a_cell_of_many_spaces_is_read(tmp_path):
     spaces = " " * (1 << 20)
     path = table(tmp_path, f"a,b\n1,2\n3,{spaces}4\n5,{spaces}\n")
     assert repr(read(path).readings.tolist()) == repr([[1.0, 2.0], [3.0, 4.0], [5.0, NAN]])
-
-
-@given(st.lists(st.sampled_from(["1", "n", "na", "N/A", "Null", "none", "nan", "-", "?", " ", "  ", ",", "\t", ";"])))
-def test_the_cells_that_are_missing_are_found_in_a_line(parts):
-    line = "".join(parts)
-    for mark in ",;\t":
-        cells = ["nan" if is_missing(cell) else cell for cell in line.split(mark)]
-        assert missing_cells(mark).sub("nan", line) == mark.join(cells)
-        assert missing_cells(mark).sub("nan", line + "\n").split() == mark.join(cells).split()

@@ -198,7 +198,7 @@ def test_addresses_of_file_systems(tmp_path):
         ("nosuch://x/a.npy", "cannot be reached"),
         (str(tmp_path / "none.npy"), "is not there"),
         (str(tmp_path), "a folder that is none of these"),
-        (str(lerobot(tmp_path / "again") / "meta/info.json"), "expected a recording: .bag"),
+        (str(lerobot(tmp_path / "again") / "meta/info.json"), "expected a field to read"),
     ]:
         with pytest.raises(InputError, match=message):
             read(address)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -69,7 +70,19 @@ WORDS = {"yes": True, "no": False, "unknown": None}
 SHOWN = 5  # likeliest materials of a touch
 BAR = 30  # characters of a probability of one
 LONGEST_LINE = 2**24  # characters of a reading, of a camera, too
-IRREGULAR = ("lost", "repeated", "late", "surplus", "untimed", "gaps", "steps_back", "relearned", "truncated")
+GIVEN_UP = 100  # lines without a reading, before the first that has one
+IRREGULAR = (
+    "left_out",
+    "lost",
+    "repeated",
+    "late",
+    "surplus",
+    "untimed",
+    "gaps",
+    "steps_back",
+    "relearned",
+    "truncated",
+)
 
 ANSWER = ("source", "answer", "probability", "known", "novelty", "seconds")
 
@@ -353,8 +366,8 @@ def live(
     file: Annotated[
         Path,
         Argument(
-            help="A .npy or .csv file of readings, a row each, or a bag; or - for lines of comma-separated numbers on "
-            "the standard input, as they come.",
+            help="A .npy or .csv file of readings, a row each, or a bag; or - for lines of numbers on the standard "
+            "input, as they come, with what a table has between them.",
             show_default=False,
         ),
     ],
@@ -369,21 +382,18 @@ def live(
     how: Reading,
 ) -> None:
     """Take readings as they come, find the touches, and show each answer grow; the memory stays as it is."""
-    from scroll_tactile.recordings.recording import places
-
     screen = console()
-    rows = _rows(file, timed, how)
-    if (columns := how.columns) is not None:
-        rows = ((time, reading[places(columns, reading.size)]) for time, reading in rows)
     growing, before = Live(console=screen, auto_refresh=False, transient=True), None
     with (
         opened(memory, mode="read") as learner,
         learner.live(risk=risk, contact="manual" if touch else "auto", of=of) as session,
         growing if screen.is_terminal and not as_json else nullcontext(),
     ):
+        lines = LiveLines(learner.sensor.channels, timed=timed, how=how)
+        rows = lines.readings() if str(file) == "-" else _replayed(file, timed, how)
         for now, at in _states(session, rows, touch):
             before = _shown(before, now, at, as_json, growing)
-    _summed_up(session.report, as_json, whole=touch)
+    _summed_up(session.report, as_json, whole=touch, left_out=lines.left_out)
 
 
 def _states(
@@ -400,32 +410,100 @@ def _states(
         yield session.end(), at
 
 
-def _rows(file: Path, timed: bool, how: Reading) -> Iterator[tuple[float | None, npt.NDArray[np.float64]]]:
-    """Readings, one after the other, with their times where these are there, as in bags, or were asked for."""
-    import numpy as np
-
+def _replayed(file: Path, timed: bool, how: Reading) -> Iterator[tuple[float | None, npt.NDArray[np.float64]]]:
+    """Readings of a file, with their times where these are there, as in bags, or were asked for."""
     from scroll_tactile.recordings import read
+    from scroll_tactile.recordings.recording import places
 
-    where = {name: value for name, value in vars(how).items() if name != "columns"}  # counted behind the time
-    if str(file) != "-":
-        recording = read(file, **where)
-        own = recording.report.clock is not None and (timed or recording.topic is not None)
-        for time, reading in zip(recording.times.tolist(), recording.readings, strict=True):
-            yield (time, reading) if own else _parted(reading, timed)  # a table names its times, or they come first
-        return
-    if named := [f"--{name} {value}" for name, value in where.items() if value is not None]:
-        raise InputError(
-            f"the standard input has readings alone; came {', '.join(named)}: leave that out, or give a file"
-        )
-    for number, line in enumerate(_lines(), start=1):
-        if not line.strip():
-            continue
-        try:
-            yield _parted(np.array([float(cell) for cell in line.split(",")]), timed)
-        except ValueError:
+    recording = read(file, **{**vars(how), "columns": None})  # which are counted behind the time
+    own = recording.report.clock is not None and (timed or recording.topic is not None)
+    for time, row in zip(recording.times.tolist(), recording.readings, strict=True):
+        # A table names its times, or they come first.
+        at, reading = (time, row) if own else (float(row[0]), row[1:]) if timed else (None, row)
+        yield at, reading if how.columns is None else reading[places(how.columns, reading.size)]
+
+
+class LiveLines:
+    """Readings out of lines of the standard input, written as tables are; others are left out, counted and told.
+
+    channels: of the sensor. timed: whether the first cell is a time; a header may name another.
+    Raises InputError for options that lines have no use for.
+    """
+
+    def __init__(self, channels: int, *, timed: bool, how: Reading) -> None:
+        from scroll_tactile.recordings.text import Layout
+
+        self.left_out = self.taken = self._width = 0
+        self._channels, self._how = channels, how
+        self._time, self._clock = 0 if timed else None, ""
+        self._layout: Layout | None = None
+        Layout.of([], how.delimiter, how.decimal)
+
+    def readings(self) -> Iterator[tuple[float | None, npt.NDArray[np.float64]]]:
+        """Each reading with its time. Raises InputError where a hundred lines, or all there are, have none."""
+        unfit = {name: value for name, value in vars(self._how).items() if value is not None}
+        for name in ("columns", "delimiter", "decimal"):
+            unfit.pop(name, None)
+        if named := [f"--{name} {value}" for name, value in unfit.items()]:
             raise InputError(
-                f"standard input, line {number}: expected numbers with commas between; came {line.strip()!r:.60}"
-            ) from None
+                f"the standard input has readings alone; came {', '.join(named)}: leave that out, or give a file"
+            )
+        error = None
+        for row, line in enumerate(_lines(), start=1):
+            try:
+                reading = self._reading(line) if line.strip() else None
+            except InputError as found:
+                error = InputError(f"standard input, line {row}: {found}", argument=found.argument)
+                self._leave_out(error)
+                continue
+            if reading is not None:
+                self.taken += 1
+                yield reading
+        if error is not None and not self.taken:
+            raise error
+
+    def _leave_out(self, error: InputError) -> None:
+        self.left_out += 1
+        if not self.taken and self.left_out == GIVEN_UP:
+            raise error
+        if set(str(self.left_out)) <= {"0", "1"} and str(self.left_out).count("1") == 1:  # 1, 10, 100 …
+            so_far = f"; {self.left_out} lines so far" if self.left_out > 1 else ""
+            console(error=True).print(f"[yellow]left out:[/] {shown(error)}{so_far}")
+
+    def _reading(self, line: str) -> tuple[float | None, npt.NDArray[np.float64]] | None:
+        """The time and the numbers of a line; None of a header. Raises InputError for other lines."""
+        import numpy as np
+
+        from scroll_tactile.recordings.recording import places
+        from scroll_tactile.recordings.text import Layout, in_seconds, is_time, moment, number
+
+        layout = self._layout or Layout.of([line.strip()], self._how.delimiter, self._how.decimal)
+        cells = layout.cells(line.strip("\n"))
+        wide = self._width or self._channels + (self._time is not None)
+        free = self._how.columns is not None and not self._width  # then the first line says how wide they are
+        if len(cells) > wide and not cells[-1].strip():
+            cells.pop()
+        values = [number(cell, layout.decimal) for cell in cells]
+        fits = len(cells) > self._channels if free else len(cells) in (wide, wide + 1)
+        if not self.taken and fits and set(values) == {None}:
+            named = (i for i, name in enumerate(cells) if is_time(name))
+            self._time = next(named, None) if self._time is None else self._time
+            self._clock = "" if self._time is None else cells[self._time]
+            return None
+        if len(cells) != wide and not free:
+            more = ". If the first is a time, add --timed; otherwise name some by --columns" * (len(cells) > wide)
+            raise InputError(f"expected {wide} numbers; came {line.strip()!r:.60}, {len(cells)} cells{more}")
+        at = None if self._time is None else moment(cells[self._time], layout.decimal)
+        if self._time is not None:
+            del values[self._time]
+            if at is None or not math.isfinite(at):
+                raise InputError(f"expected a time in cell {self._time + 1}; came {line.strip()!r:.60}")
+            at = float(in_seconds(np.array([at]), self._clock)[0]) if self._clock else at
+        chosen = values if self._how.columns is None else [values[i] for i in places(self._how.columns, len(values))]
+        if None in chosen or len(chosen) != self._channels:
+            raise InputError(f"expected {self._channels} numbers; came {line.strip()!r:.60}")
+        self._layout, self._width = layout, len(cells)
+        return at, np.array(chosen, np.float64)
 
 
 def _lines() -> Iterator[str]:
@@ -436,10 +514,6 @@ def _lines() -> Iterator[str]:
         if len(line) == LONGEST_LINE and not line.endswith("\n"):
             raise InputError(f"standard input: expected a line a reading, of less than {LONGEST_LINE} characters")
         yield line
-
-
-def _parted(row: npt.NDArray[np.float64], timed: bool) -> tuple[float | None, npt.NDArray[np.float64]]:
-    return (float(row[0]), row[1:]) if timed else (None, row)
 
 
 def _shown(before: LiveState | None, now: LiveState, at: float, as_json: bool, growing: Live) -> LiveState:
@@ -491,8 +565,8 @@ def _line(event: str, at: float, more: Mapping[str, Any]) -> None:
     say_json({"event": event, "at": round(at, 6), **more})
 
 
-def _summed_up(report: LiveReport, as_json: bool, *, whole: bool) -> None:
-    met = {name: count for name, count in vars(report).items() if count}
+def _summed_up(report: LiveReport, as_json: bool, *, whole: bool, left_out: int) -> None:
+    met = {name: count for name, count in {**vars(report), "left_out": left_out}.items() if count}
     if as_json:
         say_json({"event": "report", **met})
     if not report.touches and not whole:

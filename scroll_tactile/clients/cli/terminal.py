@@ -97,6 +97,12 @@ class Reading:
     definitions: Annotated[
         Path | None, Option(help="A folder of .msg files, for a bag that does not define its messages.")
     ] = None
+    delimiter: Annotated[
+        str | None, Option(help="What separates the cells of a table, such as ';' or tab, where it does not show.")
+    ] = None
+    decimal: Annotated[
+        str | None, Option(help="The decimal mark of a table's numbers, '.' or ',', where it does not show.")
+    ] = None
 
 
 @dataclass(frozen=True)

@@ -238,8 +238,8 @@ def _sensor_of(touches: Sequence[npt.NDArray[Any]]) -> Sensor:
     if longest < first.shape[1]:
         raise InputError(
             f"expected more readings than channels; came touches of {longest} readings of {first.shape[1]} channels. "
-            "Of (N, n, T), as aeon and sktime have it, take X.transpose(0, 2, 1); for a sensor of so many channels give "
-            "sensor=",
+            "Of (N, n, T), as aeon and sktime have it, take X.transpose(0, 2, 1); for a sensor of so many channels, "
+            "give sensor=",
             argument="sensor",
         )
     low = min(float(np.min(touch)) for touch in touches)

@@ -49,11 +49,6 @@ def index_name(log: bytes) -> str:
     return INDEX + log.hex()
 
 
-def most_bytes(group: Path) -> int:
-    """Return how many bytes of arrays the files of a checkpoint may stand for."""
-    return SPARE + RATIO * tree_size(group)
-
-
 def write_checkpoint(folder: Path, draft: Checkpoint, identity: Mapping[str, JSON]) -> str:
     """Write checked arrays as a durable zarr group in the store's folder; return the sha256 of how it describes itself.
 
@@ -68,7 +63,7 @@ def write_checkpoint(folder: Path, draft: Checkpoint, identity: Mapping[str, JSO
             sync_folder(folder)
         with replacing(final, partial):
             group = _write_zarr(partial, draft.arrays, LEVEL)
-            if sum(array.nbytes for array in draft.arrays.values()) > most_bytes(partial):
+            if sum(array.nbytes for array in draft.arrays.values()) > SPARE + RATIO * tree_size(partial):
                 # Readers make no room for so much that so little stands for: anybody could claim it.
                 remove_tree(partial)
                 group = _write_zarr(partial, draft.arrays, None)
@@ -140,7 +135,7 @@ class CheckpointReader:
         header = path / "zarr.json"
         with _reading(f"a checkpoint in {header}", header):
             known = _described(header)
-            self._room = most_bytes(path)
+            self._room = SPARE + RATIO * tree_size(path)  # bytes of arrays that its files may stand for
             self.files = dict[str, str](known["files"])  # the sha256 of each file, by its path
         self.number: int = known["number"]
         self.last_sequence: int = known["last_sequence"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import stat
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -171,7 +172,7 @@ def holds_store(folder: Path) -> bool:
     """Return whether `folder` holds a store, or what is left of one; False when one may be made there.
 
     Only looks. Raises NotAStoreError for a file and for a folder with other things in it, VersionError for a store of
-    releases 0.x, and DamageError as `require_safe`.
+    releases 0.x or of another format, and DamageError as `require_safe`.
     """
     with reported(folder, "looking for a store"):
         if not folder.exists():
@@ -181,6 +182,8 @@ def holds_store(folder: Path) -> bool:
         require_safe(folder)
         names = sorted(entry.name for entry in folder.iterdir())
         if os.path.lexists(folder / CURRENT_FILE):  # after the names: another process may have made it meanwhile
+            with suppress(DamageError, FileNotFoundError):
+                read_current(folder / CURRENT_FILE)  # refuses another format before anything is written
             return True
         if LEGACY_FILE in names:
             raise VersionError(

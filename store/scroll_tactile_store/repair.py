@@ -70,7 +70,7 @@ def repair_store(path: str | PathLike[str], *, progress: Progress | None = None)
         with reported(folder, "repairing the store"):
             survey = Survey(folder, progress or (lambda *_: None))
             try:
-                return _repair(survey) if survey.problems() else Repair(survey.last, [], None)
+                return _repair(survey) if survey.problems else Repair(survey.last, [], None)
             finally:
                 survey.close()
     finally:
@@ -106,7 +106,7 @@ def _repair(survey: Survey) -> Repair:
     if kept < last:
         what = f"rows {kept + 1} to {last} are dropped, also those that verify: {behind[0][1]}"
         lost.append(f"{what}, and nobody knows what that did to the others")
-    if not survey.rows and any(problem.path == survey.path for problem in survey.problems()):
+    if not survey.rows and any(problem.path == survey.path for problem in survey.problems):
         lost.append(f"nothing of {survey.path} can be read: the rows behind {newest}, if there were any, are lost")
     lost += [f"checkpoint {int(path.name)}: {damage}" for path, damage in survey.spoilt.items()]
 

@@ -6,7 +6,6 @@ import math
 import struct
 from array import array
 from bisect import bisect_left, bisect_right
-from typing import NamedTuple
 
 import numpy as np
 
@@ -22,13 +21,6 @@ FIELDS = struct.Struct("<QdQBBIII")
 DIGEST_BYTES = 16
 HEAD_BYTES = FIELDS.size + DIGEST_BYTES
 USUAL_HEAD = 512  # bytes that are read at once of a row's head
-
-
-class JournalRow(NamedTuple):
-    """A record's head, and the payload of its arrays; None where compaction gave that up."""
-
-    head: Head
-    payload: bytes | None
 
 
 def encode_row(
@@ -88,11 +80,11 @@ def decode_head(data: bytes, whole: int) -> Head:
     return Head(sequence, kind.decode(), label.decode(), key, time, from_json(attributes.decode()), size)
 
 
-def decode_row(data: bytes) -> JournalRow:
-    """Return the record; raise ValueError for what `encode_row` never made."""
+def decode_row(data: bytes) -> tuple[Head, bytes | None]:
+    """Return a row's head and payload, None where it gave that up; raise ValueError for what was never made."""
     head = decode_head(data, len(data))
     _, _, size, kept, *_ = FIELDS.unpack_from(data)
-    return JournalRow(head, data[len(data) - size :] if kept else None)
+    return head, data[len(data) - size :] if kept else None
 
 
 def read_head(log: Log, offset: int, size: int) -> Head:

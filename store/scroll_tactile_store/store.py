@@ -35,7 +35,7 @@ from scroll_tactile_store.exceptions import (
     StoreError,
     reported,
 )
-from scroll_tactile_store.files import is_file, remove_tree, store_folder, sync_folder, tree_size
+from scroll_tactile_store.files import remove_tree, store_folder, sync_folder, tree_size
 from scroll_tactile_store.framing import LogPlace
 from scroll_tactile_store.layout import (
     CHECKPOINT,
@@ -117,7 +117,7 @@ class Store:
             raise RecordError(f"mode must be 'write' or 'read', not {mode!r}")
         folder = store_folder(path)
         kept = None if identity is None else to_json("identity", identity)
-        is_packed = mode == "read" and is_file(folder)
+        is_packed = mode == "read" and os.path.isfile(folder)
         if not is_packed and not holds_store(folder) and (mode == "read" or kept is None):
             raise NotAStoreError(f"{folder} holds no store; to make one, open it to write and give an identity")
         return cls(folder, kept, mode)
@@ -138,7 +138,7 @@ class Store:
             if mode == "write":
                 self._lock = lock_to_write(path, identity)
                 undo.callback(self._lock.release)
-            elif is_file(path):
+            elif os.path.isfile(path):
                 self._folder = undo.enter_context(unpacked(path))
             with reported(path, "opening the store"):
                 self._current, self._log, self._rows = self._take_current()
@@ -264,11 +264,6 @@ class Store:
     def last(self) -> int:
         """The sequence of the last durable record, 0 when there is none; of a reader, at its last `state`."""
         return self.state(look=False).last
-
-    @property
-    def newest(self) -> int | None:
-        """The number of the newest checkpoint, None when there is none; of a reader, at its last `state`."""
-        return self.state(look=False).newest
 
     @property
     def compacted(self) -> int:

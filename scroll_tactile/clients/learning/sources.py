@@ -42,7 +42,9 @@ __all__ = [
     "stored_source",
 ]
 
-RECORDINGS = (".bag", ".db3", ".mcap", ".npy", ".npz", ".mat", ".csv", ".h5", ".hdf5", ".parquet", ".feather")
+RECORDINGS = (
+    ".bag", ".db3", ".mcap", ".npy", ".npz", ".mat", ".csv", ".tsv", ".jsonl", ".h5", ".hdf5", ".parquet", ".feather",
+)  # fmt: skip
 PACKED = (".part",)  # what is looked for in a remote folder: the names that packed memories have
 _LOOKED = 3  # sources are looked at for the names of columns
 WHOLE = ("metadata.yaml", "meta/info.json", ".zgroup", "zarr.json")  # in a folder that is one recording

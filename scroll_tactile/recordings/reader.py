@@ -288,9 +288,10 @@ def _recording(block: Block, source: Source, clock: str | None, columns: str | N
 
 
 def _names(source: Source, readings: npt.NDArray[Any]) -> tuple[str, ...]:
-    """The names of a table's columns, as its field lists them; none where there are none, or numbers for them."""
+    """The names of a table's columns, as its field lists them; none where it has none, or the field was requested."""
     names = tuple(name.strip() for name in source.field().split(","))
-    own = not source.topics and readings.ndim == 2 and 1 < len(names) == len(set(names)) == readings.shape[1]
+    own = source.request.field is None and not source.topics and readings.ndim == 2
+    own = own and 1 < len(names) == len(set(names)) == readings.shape[1]
     return names if own and not all(name.isdigit() for name in names) else ()
 
 

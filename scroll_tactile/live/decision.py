@@ -25,6 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
+from scroll_tactile.prediction.fitting import rehearse
 from scroll_tactile.prediction.model import Model, Trajectories
 from scroll_tactile.readouts.calibration import Dependence
 from scroll_tactile.readouts.novelty import FEWEST, UNMEASURED
@@ -83,7 +84,7 @@ def decision_rule(model: Model, risk: float) -> DecisionRule:
         raise InputError(f"expected risk as a share of wrong answers between 0 and 1; came {risk!r}")
     weighing = model.weighing
     least = 1 if weighing is None else weighing.least
-    held_out = model.held_out.trajectories
+    held_out = rehearse(model).held_out.trajectories
     if weighing is None or held_out is None or len(held_out.targets) < FEWEST or not held_out.novelty.size:
         return DecisionRule((least,), risk, sure=1 - risk, together=1 - risk, least_new=2 * UNMEASURED)
     rows = weighing.early

@@ -24,7 +24,6 @@ from scroll_tactile.live.clock import Clock
 from scroll_tactile.live.decision import DecisionRule, decision_rule
 from scroll_tactile.live.detector import ContactDetector, Event, PressDetector
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, WindowCache
-from scroll_tactile.prediction.fitting import rehearse
 from scroll_tactile.prediction.judging import estimates_of
 from scroll_tactile.prediction.model import Model, Weighing
 from scroll_tactile.prediction.predictor import Predictor, nothing_known
@@ -228,7 +227,7 @@ class LiveSession:
         self.sensor = sensor = predictor.recipe.sensor
         rest = capabilities_of(self._extractor.embedding).rest
         self._before = int(sensor.camera and isinstance(rest, str))  # frames that are no part of a touch
-        model = rehearse(predictor.present())
+        model = predictor.present()
         candidates_of(scene, model.names, model.known)
         self._scene, self._widths = scene, _checked(predictor, widths)
         self._manual, self._notes = contact == "manual", notes
@@ -330,7 +329,7 @@ class LiveSession:
         Raises what `TactileLearner.live` raises for these, and InputError after `close`. Then nothing has changed.
         """
         self._require_open()
-        model = rehearse(self._predictor.present())
+        model = self._predictor.present()
         candidates_of(scene, model.names, model.known)
         self._rule(model, risk)
         self._scene, self._risk = scene, risk
@@ -417,7 +416,7 @@ class LiveSession:
     def _begin(self, rows: Array, rest: Array | None = None) -> None:
         """A touch began with these readings, after those at rest."""
         self._recent.clear()
-        model, scene = rehearse(self._predictor.present()), self._scene
+        model, scene = self._predictor.present(), self._scene
         rule = self._rule(model, self._risk)
         prefix = None if self._detector is None else self._detector.prefix
         before, frame, limit = self._before, 1, max(round(KEPT * self.sensor.rate), 4 * model.longest)

@@ -9,7 +9,6 @@ import pytest
 from scroll_tactile import Kernels, Sensor, TactileLearner
 from scroll_tactile.errors import InputError
 from scroll_tactile.live.decision import DecisionRule, decision_rule, in_pairs, least_sure
-from scroll_tactile.prediction.fitting import rehearse
 from scroll_tactile.prediction.model import Trajectories
 from scroll_tactile.readouts.calibration import Dependence
 from scroll_tactile.results import Prediction
@@ -33,9 +32,7 @@ def learned(touches=TOUCHES, **settings):
 @cache
 def model_of(learner):
     """The model of a learner that observes nothing more."""
-    model = learner.model()
-    rehearse(model)
-    return model
+    return learner.model()
 
 
 def rule_of(learner, risk):

@@ -279,7 +279,7 @@ class Delimited(Text):
         return text > 0 and (text >= len(numbers) or numbers == [str(i) for i in range(len(numbers))])
 
     def _counts(self, data: list[list[str]]) -> bool:
-        """Whether the first of rows of numbers counts 0, 1, 2 …: one or two may be a reading that looks as those below."""
+        """Whether the first of rows of numbers counts 0, 1, 2 …: one or two may be a reading like those below."""
         if not any(data[:1]):
             return False
         numbers = [cell.strip() for cell in data[0] if cell.strip()]

@@ -234,6 +234,14 @@ def _sensor_of(touches: Sequence[npt.NDArray[Any]]) -> Sensor:
     if any(touch.ndim != 2 or touch.shape[1:] != first.shape[1:] or not touch.size for touch in touches):
         shapes = sorted({touch.shape[1:] for touch in touches})
         raise InputError(f"expected touches of shape (T, n), all of the same n; came readings of shapes {shapes[:5]}")
+    longest = max(len(touch) for touch in touches)
+    if longest < first.shape[1]:
+        raise InputError(
+            f"expected more readings than channels; came touches of {longest} readings of {first.shape[1]} channels. "
+            "Of (N, n, T), as aeon and sktime have it, take X.transpose(0, 2, 1); for a sensor of so many channels, "
+            "give sensor=",
+            argument="sensor",
+        )
     low = min(float(np.min(touch)) for touch in touches)
     high = max(float(np.max(touch)) for touch in touches)
     if not np.isfinite([low, high]).all():
@@ -241,7 +249,6 @@ def _sensor_of(touches: Sequence[npt.NDArray[Any]]) -> Sensor:
             'expected finite readings, or a sensor that says what others are: sensor=Sensor(..., non_finite="missing")'
         )
     margin = MARGIN * (high - low) or 1.0
-    longest = max(len(touch) for touch in touches)
     return Sensor(
         name="array",
         channels=first.shape[1],

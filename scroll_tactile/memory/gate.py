@@ -18,7 +18,7 @@ from typing import Literal, TypeVar
 import numpy as np
 from scroll_tactile_store import DamageError, Head, NotAStoreError, Record, Store
 from scroll_tactile_store.exceptions import reported
-from scroll_tactile_store.files import is_there, sync_folder
+from scroll_tactile_store.files import sync_folder
 
 from scroll_tactile.embeddings.registry import require_configuration
 from scroll_tactile.errors import EmbeddingError, InputError, MismatchError
@@ -109,7 +109,7 @@ class MemoryStore(Store):
 def finish_interrupted(path: Path) -> None:
     """Put the memory embedded anew in place, where the exchange was cut short just before that."""
     folder, whole = path.resolve(), beside(path, "reembedded")
-    if not is_there(folder) and is_there(whole):
+    if not os.path.exists(folder) and os.path.exists(whole):
         with reported(folder, "putting a memory embedded anew in place"):
             whole.rename(folder)
             sync_folder(folder.parent)
@@ -129,7 +129,7 @@ def open_memory(
     Raises as `TactileLearner.open`.
     """
     finish_interrupted(Path(path))
-    if request.sensor is None and not is_there(Path(path)):
+    if request.sensor is None and not os.path.exists(Path(path)):
         raise InputError(f"there is no memory in {path}; to make one, say which sensor it is for")
     try:
         store = MemoryStore.open(path, mode=mode)

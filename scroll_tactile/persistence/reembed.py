@@ -11,6 +11,7 @@ Where nothing has the memory's name, step 3 was cut short: the next opening comp
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Callable
 from itertools import islice
@@ -19,7 +20,7 @@ from typing import Any, cast
 
 from scroll_tactile_store import Record, Store, StoreError
 from scroll_tactile_store.exceptions import reported
-from scroll_tactile_store.files import is_there, sync_folder
+from scroll_tactile_store.files import sync_folder
 from scroll_tactile_store.lock import WriterLock
 
 from scroll_tactile.errors import MismatchError
@@ -61,7 +62,7 @@ class Reembedding:
         self._source, self._encode, self._bare = source, encode, identity.embedding.bare
         folder = beside(source.path, "reembedding")
         whole = beside(source.path, "reembedded")
-        if is_there(whole):  # it was complete; the old memory may have more rows now
+        if os.path.exists(whole):  # it was complete; the old memory may have more rows now
             with reported(folder, "going on with a memory embedded anew"):
                 whole.rename(folder)
         self._draft = MemoryStore.open(folder, identity=identity.to_json())

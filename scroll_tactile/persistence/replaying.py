@@ -65,7 +65,8 @@ def apply(
     after the last row. Raises CapacityError before anything is added, DamageError for what cannot be.
     """
     changed: list[Changed] | None = []
-    _note(memory, row)
+    with refusing(store.path, row):
+        _note(memory, row)
     if row.kind == Kind.OBSERVE and summed:
         memory.add_exemplar(row)
     elif row.kind == Kind.OBSERVE:
@@ -116,7 +117,7 @@ def _join(memory: Memory, row: Record, path: Path) -> None:
 
 def follow(memory: Memory, store: Store, records: Sequence[Record]) -> list[Changed] | None:
     """Take over the tuned model of a writer, and apply the rows that it appended; returns the changes as `apply`."""
-    newest = None if (number := store.newest) == memory.checkpoint else store.latest()
+    newest = None if (number := store.state(look=False).newest) == memory.checkpoint else store.latest()
     if newest is not None and newest.number == number:  # another may have come since, and rows behind these
         memory.checkpoint = number
         memory.take_tuned(MemoryFields.of(newest, memory.statistics.dimension, store.path))

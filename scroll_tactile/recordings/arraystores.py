@@ -511,7 +511,7 @@ class Hdf5(ArraySource):
         try:
             file = h5py.File(self.path, "r")
         except OSError as error:
-            if "lock" not in str(error) and "already open for write" not in str(error):
+            if "unable to lock" not in str(error) and "already open for write" not in str(error):
                 raise
             raise RecordingError(
                 f"{self.address} is being written: another program has it open. Read it once that has closed it; where "
@@ -531,19 +531,15 @@ class Hdf5(ArraySource):
         import h5py
 
         about = item.id.get_create_plist()
-        virtual = about.get_layout() == h5py.h5d.VIRTUAL
-        if virtual or about.get_external_count():
-            where = "other data sets (it is virtual)" if virtual else "other files (external storage)"
-            raise RecordingError(
-                f"{self.address}: the numbers of {name!r} lie in {where}, which may be any on this machine. Copy "
-                "it with h5repack, which puts them in"
-            )
         numbers = [about.get_filter(i)[0] for i in range(about.get_nfilters())]
-        if not set(numbers) <= set(_FILTERS) or len(set(numbers)) < len(numbers):
-            raise RecordingError(
-                f"{self.address}: {name!r} has the filters {[_FILTERS.get(n, n) for n in numbers]}; expected at "
-                f"most one each of {', '.join(_FILTERS.values())}: copy it with h5repack"
-            )
+        why = ""
+        if about.get_layout() == h5py.h5d.VIRTUAL or about.get_external_count():
+            why = "lies in other files (external storage, or a virtual data set), which may be any on this machine"
+        elif not set(numbers) <= set(_FILTERS) or len(set(numbers)) < len(numbers):
+            known = ", ".join(_FILTERS.values())
+            why = f"has the filters {[_FILTERS.get(n, n) for n in numbers]}; expected at most one each of {known}"
+        if why:
+            raise RecordingError(f"{self.address}: {name!r} {why}. Copy it with h5repack, which puts it in")
         if 1 in numbers:  # HDF5 takes all that deflate makes of a chunk, also where it is longer than a chunk
             large: list[Any] = []
             item.id.chunk_iter(lambda chunk: large.append(chunk.chunk_offset) if chunk.size > _LARGE else None)

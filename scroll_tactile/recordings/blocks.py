@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import FieldError, RecordingError, ScrollTactileError
-from scroll_tactile.recordings.bounds import Budget, require_bounded
+from scroll_tactile.recordings.bounds import require_bounded
 
 __all__ = ["Block", "Contents", "Entry", "Request", "Source", "floats", "guarded", "in_seconds", "is_clock", "rows_of"]
 
@@ -127,7 +127,7 @@ class Source(ABC):
     "run/felt/1/tactile", where a pattern found it.
     marks: the texts of a topic of labels, each with its time in seconds by the clock "log".
     continuous: whether time goes on from one episode to the next, and does not begin anew.
-    budget: what reading it may still cost. stored: its bytes on the disk. claimed: those that it becomes in memory.
+    stored: its bytes on the disk. claimed: those that it becomes in memory.
     topics, labels, annotate: whether the format has topics, something that labels, and columns beside the readings.
     """
 
@@ -136,7 +136,6 @@ class Source(ABC):
     def __init__(self, path: Path, address: str, request: Request) -> None:
         self.path, self.address, self.request = path, address, request
         self.topic = request.topic
-        self.budget = Budget(address)
         self.stored = self.claimed = 0
         self.notes: list[str] = []
         self.cut_off = False

@@ -17,10 +17,8 @@ from pathlib import Path
 from scroll_tactile.errors import RecordingError
 
 __all__ = [
-    "LARGEST",
     "RATIO",
     "SPARE",
-    "Budget",
     "on_disk",
     "read_text",
     "require_bounded",
@@ -33,60 +31,8 @@ __all__ = [
 SPARE, RATIO = 1 << 28, 256
 """Bytes that any recording may become in memory, and how many more for each byte on the disk."""
 
-SPARE_STEPS, STEPS_A_BYTE = 1 << 19, 16
-"""The same of steps of Python, of some 2 µs each: a record of a bag is one, and a message that is decoded eight."""
-
-LARGEST = 1 << 30
-"""The largest chunk or reading, in bytes, that is believed; what claims to be larger is damaged."""
-
 _PIECE = 1 << 14  # bytes, of which deflate makes 17 million at most
 _POINTER, _LONGEST_POINTER = b"version https://git-lfs.github.com/spec/", 1024
-
-
-class Budget:
-    """What one pass over a recording may still cost.
-
-    address: the recording's, for the error. stored: its bytes on the disk; `add` counts those of further files.
-    """
-
-    def __init__(self, address: str, stored: int = 0) -> None:
-        self.address, self.stored = address, 0
-        self.bytes = self.steps = self.given = 0
-        self.add(stored)
-
-    def add(self, stored: int) -> None:
-        """Count the bytes of a further file."""
-        self.stored += stored
-        self.most = SPARE + RATIO * self.stored
-        self.most_steps = SPARE_STEPS + STEPS_A_BYTE * self.stored
-
-    def take(self, count: int) -> None:
-        """Take memory, in bytes; raises RecordingError where that is more than a recording of its size can hold."""
-        self.bytes += count
-        if self.bytes > self.most:
-            self._refuse(f"{self.bytes} bytes", f"{RATIO} times as many, and {SPARE >> 20} MiB")
-
-    def give(self, count: int) -> None:
-        """Give readings out that are kept, in bytes; raises RecordingError as `take` does, of which it is no part."""
-        self.given += count
-        if self.given > self.most:
-            self._refuse(f"{self.given} bytes of readings", f"{RATIO} times as many, and {SPARE >> 20} MiB")
-
-    def room(self) -> int:
-        """How much memory is left, in bytes."""
-        return self.most - self.bytes
-
-    def work(self, steps: int = 1) -> None:
-        """Take time, in steps; raises RecordingError as `take` does."""
-        self.steps += steps
-        if self.steps > self.most_steps:
-            self._refuse(f"{self.steps} steps of work", f"{STEPS_A_BYTE} for each, and {SPARE_STEPS}")
-
-    def _refuse(self, what: str, most: str) -> None:
-        raise RecordingError(
-            f"{self.address} claims to hold {what} in {self.stored} bytes on the disk; expected at most {most}. It may "
-            "be damaged or made to harm. If it is neither, write it with less compression, or in parts"
-        )
 
 
 def require_bounded(claimed: int, stored: int, what: str) -> None:

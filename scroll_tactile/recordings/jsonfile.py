@@ -50,7 +50,7 @@ class JsonFile(Text):
         several = path.suffix.lower() != ".json" or any(line.strip() for line in more)
         self.by_line = several and first.strip() not in ("[", "{") and any(map(_is_whole, (first, *more[:2])))
         self.path_to, self.clock, self.width = (request.field or "").strip(), request.clock, 0
-        self.paths: dict[str, FieldPath] = {}
+        self.collected: dict[str, FieldPath] = {}
 
     @classmethod
     def holds_some(cls, path: Path) -> bool:
@@ -156,9 +156,9 @@ class JsonFile(Text):
             return [message]
         if isinstance(message, dict) and path in message:
             return [message[path]]
-        if path not in self.paths:
-            self.paths[path] = FieldPath(path)
-        return self.paths[path].values(message)
+        if path not in self.collected:
+            self.collected[path] = FieldPath(path)
+        return self.collected[path].values(message)
 
     def _leads(self, place: str, rows: list[Any]) -> bool:
         """Whether the field leads to something in a list's elements, or is the place of a list of numbers."""

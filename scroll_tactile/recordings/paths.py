@@ -21,10 +21,7 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import FieldError
 
-__all__ = ["CLOCK_KEYS", "FieldPath", "fields_of", "matched", "nearest", "select"]
-
-CLOCK_KEYS = ("timestamp", "timestamps", "time", "times")
-"""What an array of times is called, seconds."""
+__all__ = ["FieldPath", "fields_of", "matched", "nearest", "select"]
 
 _Step = Callable[[list[Any]], list[Any]]
 _NAME, _SPACE = re.compile(r"[A-Za-z_]\w*"), re.compile(r"\s*")

@@ -260,7 +260,7 @@ def _joined(blocks: Iterator[Block], source: Source) -> Block:
     """All blocks as one; raises RecordingError where there are none, or more than a file of this size can hold."""
     parts = []
     for block in blocks:
-        source.budget.give(block.readings.nbytes + sum(column.nbytes for column in block.annotations.values()))
+        source.claim(block.readings.nbytes + sum(column.nbytes for column in block.annotations.values()))
         parts.append(block)
     if not parts:
         raise RecordingError(f"{source.address} holds no readings")

@@ -66,7 +66,7 @@ class RosBag(Source):
         self.types = MessageTypes(request.definitions)
         self.odd: list[str] = []  # what was found before reading
         for file in self.files:
-            self.budget.add(stored_bytes(file))
+            self.stored += stored_bytes(file)
 
     def contents(self) -> Contents:
         """The numbers in the first messages of each topic, those of known sensors first."""

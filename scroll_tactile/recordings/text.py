@@ -171,7 +171,7 @@ class Text(Source):
         super().__init__(path, address, request)
         self._before = require_file(path)
         self.size = self._before.st_size
-        self.budget.add(self.size)
+        self.stored += self.size
         with path.open("rb") as file:
             head = file.read(4096)
         if (what := next((what for begin, what in _OTHERS.items() if head.startswith(begin)), None)) is not None:

@@ -6,6 +6,7 @@ import atexit
 import os
 import re
 import shutil
+import stat
 import struct
 import zipfile
 from collections.abc import Iterator
@@ -25,9 +26,7 @@ NAMES = re.compile(
 )
 BEFORE_NAME = 30  # bytes of the header before each file, which its name follows
 ARCHIVE_BYTES = BEFORE_NAME + len(CURRENT_FILE)
-LINK = 0o120000  # of a file's mode
 LARGEST = 2**46  # bytes of a packed store
-DATE = (1980, 1, 1, 0, 0, 0)  # zip's earliest: the same bytes whenever it is written
 AGAIN = "fetch it again from where it was packed"
 NO_ZIP = (zipfile.BadZipFile, struct.error, EOFError, NotImplementedError, OverflowError, RuntimeError, ValueError)
 
@@ -82,7 +81,7 @@ def _unpack(packed: zipfile.ZipFile, folder: Path, path: Path, size: int) -> Non
         raise _damage(path, "lists more bytes than it has")
     for entry in entries:
         is_plain = entry.compress_type == zipfile.ZIP_STORED and not entry.flag_bits & 1
-        is_link, is_there = entry.external_attr >> 16 & LINK == LINK, os.path.lexists(folder / entry.filename)
+        is_link, is_there = stat.S_ISLNK(entry.external_attr >> 16), os.path.lexists(folder / entry.filename)
         if not is_plain or is_link or is_there or not NAMES.fullmatch(entry.filename):
             what = "which is no file of a store, or twice, a link, compressed or encrypted"
             raise _damage(path, f"lists {entry.filename[:100]!r}, {what}")
@@ -107,6 +106,6 @@ def write_archive(folder: Path, path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path, draft), zipfile.ZipFile(draft, "x", zipfile.ZIP_STORED) as packed:
             for each in files:
-                entry = zipfile.ZipInfo(each.relative_to(folder).as_posix(), DATE)
+                entry = zipfile.ZipInfo(each.relative_to(folder).as_posix())  # of 1980, whenever it is written
                 with each.open("rb") as source, packed.open(entry, "w", force_zip64=True) as target:
                     shutil.copyfileobj(source, target, 2**20)

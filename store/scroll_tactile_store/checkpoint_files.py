@@ -11,10 +11,9 @@ import hashlib
 import re
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from math import prod
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -22,12 +21,7 @@ from scroll_tactile_store.encoding import KEPT_TYPES, NAME, array_bytes, declare
 from scroll_tactile_store.exceptions import DamageError, StoreError, VersionError, reported
 from scroll_tactile_store.files import read_regular, remove_tree, replacing, sync_folder, tree_size
 from scroll_tactile_store.layout import FORMAT_VERSION, PARTIAL, checkpoint_path, other_format
-from scroll_tactile_store.records import JSON, LARGEST_JSON, from_json, json_digest
-
-if TYPE_CHECKING:
-    import zarr
-
-__all__ = ["INDEX", "CheckpointDraft", "CheckpointReader", "index_name", "write_checkpoint"]
+from scroll_tactile_store.records import JSON, LARGEST_JSON, Checkpoint, from_json, json_digest
 
 INDEX = "log-"  # begins the name of an array of the store's own: which rows are where in a log
 
@@ -50,68 +44,48 @@ LARGEST_DESCRIPTION = 2**16  # bytes of an array's zarr.json, which has a few hu
 GONE = frozenset({errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EIO})
 
 
-@dataclass(frozen=True, eq=False)
-class CheckpointDraft:
-    """Checked arrays that are to become a checkpoint; `attributes` is JSON."""
-
-    arrays: Mapping[str, np.ndarray]
-    last_sequence: int
-    attributes: str
-
-
 def index_name(log: bytes) -> str:
     """Return the name of the array that says which rows are where in the log of this identity."""
     return INDEX + log.hex()
 
 
-def most_bytes(group: Path) -> int:
-    """Return how many bytes of arrays the files of a checkpoint may stand for."""
-    return SPARE + RATIO * tree_size(group)
-
-
-def write_checkpoint(folder: Path, number: int, draft: CheckpointDraft, identity: Mapping[str, JSON]) -> str:
-    """Write a draft as a durable zarr group in the store's folder; return the sha256 of how it describes itself.
+def write_checkpoint(folder: Path, draft: Checkpoint, identity: Mapping[str, JSON]) -> str:
+    """Write checked arrays as a durable zarr group in the store's folder; return the sha256 of how it describes itself.
 
     That is its number, `last_sequence`, attributes, the store's identity, the format and the sha256 of each of its
-    files. On any error nothing is left behind. Raises StoreFullError, ReadOnlyError, RecordError or StoreError.
+    files. Raises StoreFullError, ReadOnlyError or another StoreError.
     """
-    final = checkpoint_path(folder, number)
+    final = checkpoint_path(folder, draft.number)
     partial = final.with_name(final.name + PARTIAL)
-    try:
-        with reported(partial, f"writing checkpoint {number}"):
-            if not final.parent.is_dir():
-                final.parent.mkdir()
-                sync_folder(folder)
-            remove_tree(partial)
-            with replacing(final, partial):
-                group = _write_zarr(partial, draft.arrays, LEVEL)
-                if sum(array.nbytes for array in draft.arrays.values()) > most_bytes(partial):
-                    # Readers make no room for so much that so little stands for: anybody could claim it.
-                    remove_tree(partial)
-                    group = _write_zarr(partial, draft.arrays, None)
-                known: dict[str, Any] = {
-                    "format": FORMAT_VERSION,
-                    "number": number,
-                    "last_sequence": draft.last_sequence,
-                    "attributes": from_json(draft.attributes),
-                    "identity": identity,
-                    "files": {name: sha256 for array in draft.arrays for name, sha256 in _digests(partial, array)},
-                }
-                digest = json_digest(known)
-                group.update_attributes(known | {"sha256": digest})
-    except BaseException:
-        remove_tree(final)
-        raise
+    with reported(partial, f"writing checkpoint {draft.number}"):
+        if not final.parent.is_dir():
+            final.parent.mkdir()
+            sync_folder(folder)
+        with replacing(final, partial):
+            group = _write_zarr(partial, draft.arrays, LEVEL)
+            if sum(array.nbytes for array in draft.arrays.values()) > SPARE + RATIO * tree_size(partial):
+                # Readers make no room for so much that so little stands for: anybody could claim it.
+                remove_tree(partial)
+                group = _write_zarr(partial, draft.arrays, None)
+            known: dict[str, Any] = {
+                "format": FORMAT_VERSION,
+                "number": draft.number,
+                "last_sequence": draft.last_sequence,
+                "attributes": draft.attributes,
+                "identity": identity,
+                "files": {
+                    path.relative_to(partial).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+                    for array in draft.arrays
+                    for path in sorted((partial / array).rglob("*"))
+                    if path.is_file()
+                },
+            }
+            digest = json_digest(known)
+            group.update_attributes(known | {"sha256": digest})
     return digest
 
 
-def _digests(group: Path, array: str) -> Iterator[tuple[str, str]]:
-    for path in sorted((group / array).rglob("*")):
-        if path.is_file():
-            yield path.relative_to(group).as_posix(), hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def _write_zarr(path: Path, arrays: Mapping[str, np.ndarray], level: int | None) -> zarr.Group:
+def _write_zarr(path: Path, arrays: Mapping[str, np.ndarray], level: int | None) -> Any:
     # Imported late: 0.3 s that a process which only appends need not spend.
     import zarr
     from zarr.codecs import ZstdCodec
@@ -161,7 +135,7 @@ class CheckpointReader:
         header = path / "zarr.json"
         with _reading(f"a checkpoint in {header}", header):
             known = _described(header)
-            self._room = most_bytes(path)
+            self._room = SPARE + RATIO * tree_size(path)  # bytes of arrays that its files may stand for
             self.files = dict[str, str](known["files"])  # the sha256 of each file, by its path
         self.number: int = known["number"]
         self.last_sequence: int = known["last_sequence"]

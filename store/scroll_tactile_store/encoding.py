@@ -14,8 +14,6 @@ import numpy as np
 from scroll_tactile_store.exceptions import RecordError
 from scroll_tactile_store.records import from_json
 
-__all__ = ["NAME", "array_bytes", "check_arrays", "declared_size", "decode_payload", "encode_payload"]
-
 # Every append waits for it: the levels of a BioTac touch's readings, 7.6 KB, become 3.4 KB in 0.06 ms.
 LEVEL = 1
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"

@@ -1,17 +1,4 @@
-"""What the store raises, grouped by what the caller does next, and how failures of the system become these errors.
-
-Exception
-└── StoreError             anything that the store reports
-    ├── LockedError        another writer holds the store: close that one, or open with mode="read"
-    ├── NotAStoreError     the path holds no store: give another path, or an identity to create one
-    ├── VersionError       another release wrote it; nothing was touched
-    ├── DamageError        bytes on the disk are not those that were written: repair_store keeps what verifies
-    ├── CompactedError     compaction gave up this row's arrays: resume from the compaction checkpoint
-    ├── StoreFullError     no space is left: free some and call again; nothing acknowledged is lost
-    ├── ReadOnlyError      the store, or its folder, may not be written from here
-    ├── StoreClosedError   the store was closed, or belongs to the process that forked this one
-    └── RecordError        this cannot be stored as it is (also a ValueError)
-"""
+"""What the store raises, a class for each thing that a caller does next; and how the system's errors become these."""
 
 from __future__ import annotations
 
@@ -19,21 +6,6 @@ import errno
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-
-__all__ = [
-    "FULL",
-    "CompactedError",
-    "DamageError",
-    "LockedError",
-    "NotAStoreError",
-    "ReadOnlyError",
-    "RecordError",
-    "StoreClosedError",
-    "StoreError",
-    "StoreFullError",
-    "VersionError",
-    "reported",
-]
 
 FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
 FORBIDDEN = frozenset({errno.EACCES, errno.EPERM, errno.EROFS})
@@ -44,11 +16,11 @@ class StoreError(Exception):
 
 
 class LockedError(StoreError):
-    """Another writer holds the store; its process id, host and since when are in the message."""
+    """Another writer holds the store, the message says which: close that one, or open with mode="read"."""
 
 
 class NotAStoreError(StoreError):
-    """The path holds no store, or holds something else, which is left as it is."""
+    """The path holds no store: give another path, or an identity to make one. What is there is left as it is."""
 
 
 class VersionError(StoreError):
@@ -81,11 +53,11 @@ class DamageError(StoreError):
 
 
 class CompactedError(StoreError):
-    """Compaction gave up the arrays of this row, on purpose; its head is still there."""
+    """Compaction gave up the arrays of this row, on purpose: resume from the compaction checkpoint."""
 
 
 class StoreFullError(StoreError):
-    """The disk, or a quota on it, is full. The call had no effect and may be repeated."""
+    """The disk, or a quota on it, is full: free some and call again. The call had no effect."""
 
 
 class ReadOnlyError(StoreError):

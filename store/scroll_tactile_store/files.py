@@ -22,8 +22,6 @@ else:
 # Not through a link, nor waiting for whoever might write into a pipe. Windows has neither.
 CAREFULLY = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 
-PART = 2**20  # bytes that are copied at once
-BLOCK = 512  # bytes, of st_blocks
 SPARE, RATIO = 64 * 2**20, 16  # what a file may claim beyond its bytes on the disk
 
 
@@ -106,22 +104,6 @@ def replacing(path: Path, draft: Path) -> Iterator[None]:
     sync_folder(path.parent)
 
 
-def is_there(path: Path) -> bool:
-    """Return whether anything is there; not where nothing can be, as under a name that is too long."""
-    try:
-        return path.exists()
-    except OSError:
-        return False
-
-
-def is_file(path: Path) -> bool:
-    """Return whether a regular file is there, also by a link; not where nothing can be."""
-    try:
-        return stat.S_ISREG(path.stat().st_mode)
-    except (OSError, ValueError):
-        return False
-
-
 def read_regular(path: Path, limit: int, *, within: Path | None = None) -> bytes:
     """Return the bytes of a regular file of at most `limit` bytes; raises as `regular_file`."""
     with regular_file(path, limit, within=within) as (file, size):
@@ -131,7 +113,7 @@ def read_regular(path: Path, limit: int, *, within: Path | None = None) -> bytes
 def copy_regular(path: Path, target: Path, limit: int, *, within: Path | None = None) -> None:
     """Copy a regular file of at most `limit` bytes, a part at a time; raises as `regular_file`."""
     with regular_file(path, limit, within=within) as (file, _), target.open("xb") as copy:
-        shutil.copyfileobj(file, copy, PART)
+        shutil.copyfileobj(file, copy)
 
 
 @contextmanager
@@ -168,7 +150,7 @@ def open_regular(path: Path, flags: int) -> int:
 def dense_size(descriptor: int, path: Path) -> int:
     """Return the bytes of an open file. Raises DamageError where next to nothing of them is on the disk."""
     found = os.fstat(descriptor)
-    stored = getattr(found, "st_blocks", 0) * BLOCK  # 0 also where the file system does not tell
+    stored = 512 * getattr(found, "st_blocks", 0)  # 0 also where the file system does not tell
     if stored and found.st_size > SPARE + RATIO * stored:
         raise DamageError(
             f"{path} says that it has {found.st_size} bytes, and {stored} are on the disk: nothing of it was read. In "
@@ -179,12 +161,12 @@ def dense_size(descriptor: int, path: Path) -> int:
 
 
 def store_folder(path: str | os.PathLike[str]) -> Path:
-    """Return the absolute path of a folder; raise NotAStoreError for what no file system could call so."""
+    """Return the absolute path of a folder, `~` its home; raise NotAStoreError for what no file system calls so."""
     try:
-        folder = Path(path).absolute()
+        folder = Path(path).expanduser().absolute()
         if b"\0" not in os.fsencode(folder):
             return folder
-    except (TypeError, UnicodeEncodeError):
+    except (TypeError, UnicodeEncodeError, RuntimeError):  # the last where nobody has this home
         pass
     raise NotAStoreError(f"expected the path of a folder; came {path!r}, which is none")
 

@@ -43,11 +43,6 @@ class Frame(NamedTuple):
     checksum: bytes
 
     @property
-    def payload_offset(self) -> int:
-        """Where its payload begins."""
-        return self.offset + FRAME_BYTES
-
-    @property
     def end(self) -> int:
         """Where the next frame begins."""
         return self.offset + FRAME_BYTES + self.size

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import stat
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -91,18 +92,15 @@ class Current:
 
     @classmethod
     def from_bytes(cls, data: bytes, path: Path) -> Self:
-        """Return what `to_bytes` wrote. Raises VersionError for another format, DamageError for anything else."""
-        try:
-            known: dict[str, Any] = dict(from_json(data.decode("ascii")))
-            if known.pop("sha256", None) != json_digest(known):
-                raise ValueError("its sha256 differs")
-            if known["format"] != FORMAT_VERSION:
-                raise VersionError(other_format(path, known["format"]))
-            number, identity = known["log"]
-            named = [NamedCheckpoint.read(known[name]) for name in ("newest", "compaction")]
-            return cls(_count(number), bytes.fromhex(identity), *named, last=_count(known.get("last", 0)))
-        except (KeyError, TypeError, ValueError) as error:
-            raise _not_as_written(path, error) from error
+        """Return what `to_bytes` wrote. Raises VersionError for another format; KeyError, TypeError, ValueError."""
+        known: dict[str, Any] = dict(from_json(data.decode("ascii")))
+        if known.pop("sha256", None) != json_digest(known):
+            raise ValueError("its sha256 differs")
+        if known["format"] != FORMAT_VERSION:
+            raise VersionError(other_format(path, known["format"]))
+        number, identity = known["log"]
+        newest, compaction = NamedCheckpoint.read(known["newest"]), NamedCheckpoint.read(known["compaction"])
+        return cls(_count(number), bytes.fromhex(identity), newest, compaction, _count(known.get("last", 0)))
 
 
 def other_format(path: Path, version: int) -> str:
@@ -110,22 +108,10 @@ def other_format(path: Path, version: int) -> str:
     what = f"{path} is written in format {version}"
     if version in OLDER:
         releases, last = OLDER[version]
-        return (
-            f"{what}, by scroll-tactile {releases}; this one reads format {FORMAT_VERSION}: learn it again from the "
-            f"recordings, or open it with scroll-tactile {last}"
-        )
-    return (
-        f"{what}; this release reads format {FORMAT_VERSION}: upgrade it, or open the store with the release that "
-        "wrote it; nothing was changed"
-    )
-
-
-def _not_as_written(path: Path, error: Exception) -> DamageError:
-    return DamageError(
-        f"{path} is not as it was written ({error}): repair the store (repair_store), which finds the log and the "
-        "checkpoints by themselves",
-        path=path,
-    )
+        what += f", by scroll-tactile {releases}; this one reads format {FORMAT_VERSION}: learn it again from the"
+        return f"{what} recordings, or open it with scroll-tactile {last}"
+    what += f"; this release reads format {FORMAT_VERSION}: upgrade it, or open the store with the release"
+    return f"{what} that wrote it; nothing was changed"
 
 
 def _count(value: Any) -> int:
@@ -137,10 +123,10 @@ def _count(value: Any) -> int:
 def read_current(path: Path) -> Current:
     """Return what the `CURRENT` at `path` says. Raises DamageError, VersionError, and OSError where it is not there."""
     try:
-        data = read_regular(path, LARGEST_CURRENT)
-    except DamageError as error:
-        raise _not_as_written(path, error) from error
-    return Current.from_bytes(data, path)
+        return Current.from_bytes(read_regular(path, LARGEST_CURRENT), path)
+    except (DamageError, KeyError, TypeError, ValueError) as error:
+        what = f"{path} is not as it was written ({error}): repair the store (repair_store), which finds"
+        raise DamageError(f"{what} the log and the checkpoints by themselves", path=path) from error
 
 
 def write_current(folder: Path, current: Current) -> None:
@@ -183,10 +169,10 @@ def _numbered(folder: Path, begin: str, end: str) -> dict[Path, int]:
 
 
 def holds_store(folder: Path) -> bool:
-    """Return whether `folder` holds a store that this release reads; False when one may be made there.
+    """Return whether `folder` holds a store, or what is left of one; False when one may be made there.
 
-    Only looks. Raises NotAStoreError for a file and for a folder with other things in it, VersionError for another
-    format, and DamageError where `CURRENT` is damaged, or gone while what it named is still there.
+    Only looks. Raises NotAStoreError for a file and for a folder with other things in it, VersionError for a store of
+    releases 0.x or of another format, and DamageError as `require_safe`.
     """
     with reported(folder, "looking for a store"):
         if not folder.exists():
@@ -194,11 +180,11 @@ def holds_store(folder: Path) -> bool:
         if not folder.is_dir():
             raise NotAStoreError(f'{folder} is a file: a packed store is opened with mode="read", or merged')
         require_safe(folder)
-        try:
-            read_current(folder / CURRENT_FILE)
+        names = sorted(entry.name for entry in folder.iterdir())
+        if os.path.lexists(folder / CURRENT_FILE):  # after the names: another process may have made it meanwhile
+            with suppress(DamageError, FileNotFoundError):
+                read_current(folder / CURRENT_FILE)  # refuses another format before anything is written
             return True
-        except FileNotFoundError:
-            names = sorted(entry.name for entry in folder.iterdir())
         if LEGACY_FILE in names:
             raise VersionError(
                 f"{folder} was made by a release 0.x, whose memories this one does not read: learn it again from the "
@@ -206,18 +192,11 @@ def holds_store(folder: Path) -> bool:
             )
         # The first log is made before `CURRENT`: a writer may have died in between.
         logs, first = [log_path(folder, number) for number in numbers(folder, LOG)], log_path(folder, 1)
-        traces = [log.name for log in logs if log != first or _has_batches(log)]
-        traces += [name for name in names if DAMAGED in name] + [CHECKPOINTS] * any(numbers(folder, CHECKPOINT))
-        foreign = [name for name in names if not name.startswith(OURS) and name not in (LOCK_FILE, CHECKPOINTS)]
-        if os.path.lexists(folder / CURRENT_FILE):
-            return True  # another process made it meanwhile
-        if traces:
-            raise DamageError(
-                f"{folder} has {' and '.join(traces)} but no {CURRENT_FILE}: put it back from a copy, or repair the "
-                "store (repair_store), which finds what it named",
-                path=folder / CURRENT_FILE,
-            )
-        if foreign:
+        if any(DAMAGED in name for name in names) or any(numbers(folder, CHECKPOINT)):
+            return True
+        if any(log != first or _has_batches(log) for log in logs):
+            return True
+        if foreign := [name for name in names if not name.startswith(OURS) and name not in (LOCK_FILE, CHECKPOINTS)]:
             raise NotAStoreError(
                 f"{folder} holds no store but other things ({', '.join(foreign[:3])}…): nothing was written; choose an "
                 "empty or a new folder"

@@ -8,7 +8,6 @@ import socket
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from scroll_tactile_store.exceptions import DamageError, LockedError, NotAStoreError, StoreError, reported
 from scroll_tactile_store.files import new_file, read_regular, sync_folder
@@ -22,9 +21,6 @@ from scroll_tactile_store.layout import (
     write_current,
 )
 from scroll_tactile_store.log import create_log
-
-if TYPE_CHECKING:
-    from filelock import BaseFileLock
 
 LARGEST_NOTE = 4096  # bytes
 
@@ -43,7 +39,7 @@ class WriterLock:
         self._folder = folder
         # Not per thread: the thread that closes the store need not be the one that opened it.
         # Nor the lock of a file's mere presence, which filelock takes where there is no other: it outlives its holder.
-        self._lock: BaseFileLock = FileLock(folder / LOCK_FILE, thread_local=False, fallback_to_soft=False)
+        self._lock = FileLock(folder / LOCK_FILE, thread_local=False, fallback_to_soft=False)
         with reported(folder, "taking the writer's lock, without which two writers could spoil it"):
             try:
                 self._lock.acquire(blocking=False)
@@ -69,7 +65,8 @@ class WriterLock:
     def _refusal(self) -> str:
         try:
             holder = json.loads(read_regular(self._folder / HOLDER_FILE, LARGEST_NOTE))
-            who = f"process {holder['pid']} on {holder['host']} since {holder['since']}"
+            ours = "this process, " if (holder["pid"], holder["host"]) == (os.getpid(), socket.gethostname()) else ""
+            who = f"{ours}process {holder['pid']} on {holder['host']} since {holder['since']}"
         except (OSError, ValueError, TypeError, KeyError, RecursionError, DamageError):
             # The holder writes the note just after it takes the lock and removes it just before it releases it.
             who = "a process that left no note of itself"

@@ -14,7 +14,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Self
 
-from scroll_tactile_store.exceptions import FULL, DamageError, StoreClosedError, VersionError, reported
+from scroll_tactile_store.exceptions import FULL, DamageError, VersionError, reported
 from scroll_tactile_store.files import dense_size, new_file, open_regular, replacing, sync_open
 from scroll_tactile_store.framing import (
     COMMIT,
@@ -37,6 +37,7 @@ logger = logging.getLogger(__name__)
 # behind the damage.
 Damaged = Callable[[DamageError, list[Frame]], object]
 
+NEWER = f"this release reads format {VERSION}: upgrade it; nothing was changed"
 BEGIN = LogPlace(0, 0, 0, NO_CHECKSUM)
 USUAL = 2**13  # bytes of a frame, which are read at once
 PART = 2**18  # bytes of the file that are looked through at once
@@ -53,8 +54,7 @@ NO_ROOM = FULL | {errno.EFBIG}
 
 def refuse(damage: DamageError, _: list[Frame]) -> None:
     """Raise what is damaged: whoever uses a store goes on behind no damage."""
-    what = f"{damage}: repair the store (repair_store)"
-    raise DamageError(what, path=damage.path, offset=damage.offset, frame=damage.frame) from damage
+    raise damage
 
 
 class Log:
@@ -80,35 +80,27 @@ class Log:
             self._read_header(identity)
             self._begin_batch()
         except BaseException:
-            self._release()
+            self.close()
             raise
 
     def _read_header(self, identity: bytes | None) -> None:
         self.place = BEGIN
         try:
-            frame = self._first_frame()
-            self.identity, self._mark = frame.identity, MARK + frame.identity
+            frame = read_frame(self.at(0, FRAME_BYTES), 0)
+            if frame is not None and frame.version > VERSION:
+                raise VersionError(f"{self.path} is written in format {frame.version}; {NEWER}")
+            if frame is None or frame[3:6] != (0, 0, HEADER):
+                raise self._damage("does not begin as a log, or its first frame is not as it was written", BEGIN)
+            if identity not in (None, frame.identity):
+                raise self._damage("is the log of another store, or of another time", BEGIN)
+            self.identity = frame.identity
             self.header = self._payload(frame, b"")
             self.place = LogPlace.behind(frame)
         except DamageError as damage:
             if identity is None:
                 raise
-            self.header_damage = damage
-            self.identity, self._mark = identity, MARK + identity
-        self.first = self.place
-
-    def _first_frame(self) -> Frame:
-        frame = read_frame(self.at(0, FRAME_BYTES), 0)
-        if frame is None:
-            raise self._damage("does not begin as a log, or its first frame is not as it was written", BEGIN)
-        if frame.version > VERSION:
-            raise VersionError(
-                f"{self.path} is written in format {frame.version}; this release reads format {VERSION}: upgrade it; "
-                "nothing was changed"
-            )
-        if frame.version != VERSION or frame[3:6] != (0, 0, HEADER) or frame.previous != NO_CHECKSUM:
-            raise self._damage("does not begin with the first frame of a log", BEGIN)
-        return frame
+            self.header_damage, self.identity = damage, identity
+        self.first, self._mark = self.place, MARK + self.identity
 
     def _damage(self, what: str, at: LogPlace | Frame) -> DamageError:
         return DamageError(f"{self.path} {what} (byte {at.offset})", path=self.path, offset=at.offset, frame=at.number)
@@ -122,21 +114,16 @@ class Log:
             return bytes(self._staged[begin : begin + size])
         if (size := min(size, self.size() - offset)) <= 0 or offset < 0:
             return b""
-        os.lseek(self._open(), offset, os.SEEK_SET)
+        os.lseek(self._descriptor, offset, os.SEEK_SET)
         data = part = os.read(self._descriptor, size)
         while part and len(data) < size:
             part = os.read(self._descriptor, size - len(data))
             data += part
         return data
 
-    def _open(self) -> int:
-        if self._descriptor < 0:
-            raise StoreClosedError(f"the log {self.path} is closed")
-        return self._descriptor
-
     def size(self) -> int:
         """Return the bytes of the file. Raises DamageError where they are holes, which no log has."""
-        return dense_size(self._open(), self.path)
+        return dense_size(self._descriptor, self.path)
 
     def _is_ours(self, frame: Frame) -> bool:
         return frame.version == VERSION and frame.identity == self.identity
@@ -150,7 +137,10 @@ class Log:
         if self.place == BEGIN:
             self._resume(BEGIN)
         while True:
-            frames, torn, proof = self._next_batch(durable)
+            for _ in range(ATTEMPTS):
+                frames, torn = self._batch()
+                if torn is None or (proof := self._proof(torn, durable)) is None:
+                    break
             if torn is None:
                 self.place = LogPlace.behind(frames.pop())
                 if frames:
@@ -158,23 +148,10 @@ class Log:
             elif proof is None:
                 return
             else:
-                what = (
-                    f"is damaged: frame {torn.number} is not as it was written, and {proof} proves that it was durable"
-                )
-                damaged(self._damage(f"{what}. What is before it verifies and can be kept", torn), frames)
+                what = f"is damaged: frame {torn.number} is not as it was written, and was durable, as {proof} proves"
+                damaged(self._damage(f"{what}: repair the store (repair_store)", torn), frames)
                 if not self._resume(torn):
                     return
-
-    def _next_batch(self, durable: LogPlace | None) -> tuple[list[Frame], LogPlace | None, str | None]:
-        """Return the next batch; or what verifies of it, the place where it ends, and what proves that it was whole."""
-        for attempt in range(ATTEMPTS):
-            frames, torn = self._batch()
-            if torn is None:
-                return frames, None, None
-            proof = self._proof(torn, durable) if attempt else None
-            if attempt and proof is None:
-                break
-        return frames, torn, proof
 
     def _batch(self) -> tuple[list[Frame], LogPlace | None]:
         """Return the frames from the place on that verify, up to a commit frame, or the place where one does not."""
@@ -197,7 +174,7 @@ class Log:
         """Return the payload of a frame, verified; begin: what was read of it, and maybe of what is behind it."""
         payload = begin[: frame.size]
         if len(payload) < frame.size:
-            payload += self.at(frame.payload_offset + len(payload), frame.size - len(payload))
+            payload += self.at(frame.offset + FRAME_BYTES + len(payload), frame.size - len(payload))
         if len(payload) != frame.size or payload_digest(payload) != frame.digest:
             raise self._damage(f"is damaged: the payload of frame {frame.number} is not as it was written", frame)
         return payload
@@ -275,7 +252,7 @@ class Log:
     def _settle(self) -> None:
         """Cut off what is behind the last commit, where something may be; raises OSError."""
         if not self._settled:
-            os.ftruncate(self._open(), self.place.offset)
+            os.ftruncate(self._descriptor, self.place.offset)
             self._allocated = self.place.offset
             sync_open(self._descriptor)
             self._settled = True
@@ -315,7 +292,7 @@ class Log:
 
     def _put(self, offset: int, data: bytearray) -> None:
         """Write all bytes at an offset, in one call unless the system takes fewer."""
-        os.lseek(self._open(), offset, os.SEEK_SET)
+        os.lseek(self._descriptor, offset, os.SEEK_SET)
         done = os.write(self._descriptor, data)
         while done < len(data):
             done += os.write(self._descriptor, data[done:])
@@ -348,14 +325,11 @@ class Log:
 
     def close(self, *, trim: bool = False) -> None:
         """Close the file; a second call does nothing. trim: give back the room ahead, of a log that was written."""
-        if trim and self._descriptor >= 0:
-            with suppress(OSError):
-                os.ftruncate(self._descriptor, self.place.offset)
-        self._release()
-
-    def _release(self) -> None:
         descriptor, self._descriptor = self._descriptor, -1
         if descriptor >= 0:
+            with suppress(OSError):
+                if trim:
+                    os.ftruncate(descriptor, self.place.offset)
             os.close(descriptor)
 
     def __enter__(self) -> Self:

@@ -9,13 +9,14 @@ from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 
-from scroll_tactile_store.exceptions import DamageError, reported
+from scroll_tactile_store.exceptions import DamageError, NotAStoreError, reported
 from scroll_tactile_store.files import store_folder, sync_folder
 from scroll_tactile_store.layout import (
     DAMAGED,
     LOG,
     NEW,
     Current,
+    holds_store,
     log_path,
     numbers,
     remove_unnamed,
@@ -26,7 +27,7 @@ from scroll_tactile_store.lock import WriterLock
 from scroll_tactile_store.log import Log, create_log
 from scroll_tactile_store.records import to_json
 from scroll_tactile_store.rows import ROW, head_without_arrays, read_back, read_head
-from scroll_tactile_store.survey import Progress, Survey, require_store
+from scroll_tactile_store.survey import Progress, Survey
 
 
 @dataclass(frozen=True)
@@ -61,14 +62,15 @@ def repair_store(path: str | PathLike[str], *, progress: Progress | None = None)
     ReadOnlyError and other StoreErrors.
     """
     folder = store_folder(path)
-    require_store(folder)
+    if not holds_store(folder):
+        raise NotAStoreError(f"{folder} holds no store")
     require_safe(folder, written=True)
     lock = WriterLock(folder)
     try:
         with reported(folder, "repairing the store"):
             survey = Survey(folder, progress or (lambda *_: None))
             try:
-                return _repair(survey) if survey.problems() else Repair(survey.last, [], None)
+                return _repair(survey) if survey.problems else Repair(survey.last, [], None)
             finally:
                 survey.close()
     finally:
@@ -104,7 +106,7 @@ def _repair(survey: Survey) -> Repair:
     if kept < last:
         what = f"rows {kept + 1} to {last} are dropped, also those that verify: {behind[0][1]}"
         lost.append(f"{what}, and nobody knows what that did to the others")
-    if not survey.rows and any(problem.path == survey.path for problem in survey.problems()):
+    if not survey.rows and any(problem.path == survey.path for problem in survey.problems):
         lost.append(f"nothing of {survey.path} can be read: the rows behind {newest}, if there were any, are lost")
     lost += [f"checkpoint {int(path.name)}: {damage}" for path, damage in survey.spoilt.items()]
 
@@ -114,11 +116,11 @@ def _repair(survey: Survey) -> Repair:
     identity = create_log(path, to_json("identity", survey.identity).encode(), _rows(survey, kept, compacted))
     with Log(path) as log:
         rows = read_back(log)
-        named = [
+        start, stand_in = (
             None if each is None else replace(each, place=rows.place(log, each.last_sequence))
             for each in (start, stand_in)
-        ]
-    current = Current(number, identity, *named, kept)
+        )
+    current = Current(number, identity, start, stand_in, kept)
     damaged = [*survey.spoilt, *(log_path(folder, other) for other in numbers(folder, LOG) if other != number)]
     aside = {each: _put_aside(each) for each in damaged if each.exists()}
     write_current(folder, current)

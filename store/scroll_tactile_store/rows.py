@@ -6,7 +6,6 @@ import math
 import struct
 from array import array
 from bisect import bisect_left, bisect_right
-from typing import NamedTuple
 
 import numpy as np
 
@@ -22,13 +21,6 @@ FIELDS = struct.Struct("<QdQBBIII")
 DIGEST_BYTES = 16
 HEAD_BYTES = FIELDS.size + DIGEST_BYTES
 USUAL_HEAD = 512  # bytes that are read at once of a row's head
-
-
-class JournalRow(NamedTuple):
-    """A record's head, and the payload of its arrays; None where compaction gave that up."""
-
-    head: Head
-    payload: bytes | None
 
 
 def encode_row(
@@ -88,11 +80,11 @@ def decode_head(data: bytes, whole: int) -> Head:
     return Head(sequence, kind.decode(), label.decode(), key, time, from_json(attributes.decode()), size)
 
 
-def decode_row(data: bytes) -> JournalRow:
-    """Return the record; raise ValueError for what `encode_row` never made."""
+def decode_row(data: bytes) -> tuple[Head, bytes | None]:
+    """Return a row's head and payload, None where it gave that up; raise ValueError for what was never made."""
     head = decode_head(data, len(data))
     _, _, size, kept, *_ = FIELDS.unpack_from(data)
-    return JournalRow(head, data[len(data) - size :] if kept else None)
+    return head, data[len(data) - size :] if kept else None
 
 
 def read_head(log: Log, offset: int, size: int) -> Head:
@@ -139,7 +131,7 @@ class Rows:
                     self._take(log, frame)
         if self.last < last:
             what = f"{log.path} ends with row {self.last}, and had row {last}: its end is damaged or was cut off"
-            refuse(DamageError(what, path=log.path), [])
+            raise DamageError(f"{what}: repair the store (repair_store)", path=log.path)
 
     def _take(self, log: Log, frame: Frame) -> None:
         data = log.read(frame.offset, frame.size, first=HEAD_BYTES + 8)
@@ -148,8 +140,8 @@ class Rows:
             if self.sequences and sequence <= self.sequences[-1]:
                 raise ValueError(f"row {sequence} follows row {self.sequences[-1]}")
         except ValueError as error:
-            what = f"{log.path} has a frame that is no row (byte {frame.offset}): {error}"
-            refuse(DamageError(what, path=log.path, offset=frame.offset), [])
+            what = f"{log.path} has a frame that is no row (byte {frame.offset}): {error}: repair the store"
+            raise DamageError(f"{what} (repair_store)", path=log.path, offset=frame.offset) from error
         self.append(
             sequence, frame.offset, frame.size, data[HEAD_BYTES : HEAD_BYTES + min(8, FIELDS.unpack_from(data)[4])]
         )

@@ -20,7 +20,6 @@ from scroll_tactile_store.archive import unpacked
 from scroll_tactile_store.backup import back_up
 from scroll_tactile_store.checkpoint_files import (
     INDEX,
-    CheckpointDraft,
     CheckpointReader,
     index_name,
     write_checkpoint,
@@ -36,7 +35,7 @@ from scroll_tactile_store.exceptions import (
     StoreError,
     reported,
 )
-from scroll_tactile_store.files import is_file, remove_tree, store_folder, sync_folder, tree_size
+from scroll_tactile_store.files import remove_tree, store_folder, sync_folder, tree_size
 from scroll_tactile_store.framing import LogPlace
 from scroll_tactile_store.layout import (
     CHECKPOINT,
@@ -118,7 +117,7 @@ class Store:
             raise RecordError(f"mode must be 'write' or 'read', not {mode!r}")
         folder = store_folder(path)
         kept = None if identity is None else to_json("identity", identity)
-        is_packed = mode == "read" and is_file(folder)
+        is_packed = mode == "read" and os.path.isfile(folder)
         if not is_packed and not holds_store(folder) and (mode == "read" or kept is None):
             raise NotAStoreError(f"{folder} holds no store; to make one, open it to write and give an identity")
         return cls(folder, kept, mode)
@@ -139,7 +138,7 @@ class Store:
             if mode == "write":
                 self._lock = lock_to_write(path, identity)
                 undo.callback(self._lock.release)
-            elif is_file(path):
+            elif os.path.isfile(path):
                 self._folder = undo.enter_context(unpacked(path))
             with reported(path, "opening the store"):
                 self._current, self._log, self._rows = self._take_current()
@@ -165,34 +164,31 @@ class Store:
     def _take_current(self) -> tuple[Current, Log, Rows]:
         """Return what `CURRENT` says now, the log that it names, and the rows of that."""
         for _ in range(ATTEMPTS):
-            current = read_current(self._folder / CURRENT_FILE)
-            path = log_path(self._folder, current.log)
             try:
-                log = Log(path, write=self.mode == "write")
+                current = read_current(self._folder / CURRENT_FILE)
+                log = Log(
+                    log_path(self._folder, current.log), write=self.mode == "write", identity=current.log_identity
+                )
                 break
-            except FileNotFoundError as error:
-                # A writer removes a log after another has taken its place.
-                if read_current(self._folder / CURRENT_FILE) == current:
-                    what = f"{path}, which {CURRENT_FILE} names, is not there: put it back from a copy, or repair the"
-                    raise DamageError(
-                        f"{what} store (repair_store), which resumes from what verifies", path=path
-                    ) from error
+            except FileNotFoundError as error:  # a writer removes a log after another has taken its place
+                gone = Path(error.filename)
         else:
-            raise StoreError(f"{self.path} is compacted again and again: open it later")
+            what = f"{gone} is not there: put it back from a copy, or repair the store (repair_store), which resumes"
+            raise DamageError(f"{what} from what verifies", path=gone)
         try:
-            rows = self._read(current, log)
-            self.identity: Mapping[str, JSON] = from_json(log.header.decode())
-        except BaseException as error:
+            return current, log, self._read(current, log)
+        except BaseException:
             log.close()
-            if isinstance(error, ValueError):
-                what = f"the identity in {log.path} was never written so: {error}"
-                raise DamageError(what, path=log.path) from error
             raise
-        return current, log, rows
 
     def _read(self, current: Current, log: Log) -> Rows:
-        if log.identity != current.log_identity:
-            raise DamageError(f"{log.path} is the log of another store, or of another time", path=log.path)
+        if log.header_damage is not None:
+            raise DamageError(f"{log.header_damage}: repair the store (repair_store)", path=log.path, offset=0, frame=0)
+        try:
+            self.identity: Mapping[str, JSON] = from_json(log.header.decode())
+        except ValueError as error:
+            what = f"the identity in {log.path} was never written so: {error}"
+            raise DamageError(what, path=log.path) from error
         rows = Rows()
         if (named := current.newest) is not None:
             if not log.has_place(named.place):
@@ -268,11 +264,6 @@ class Store:
     def last(self) -> int:
         """The sequence of the last durable record, 0 when there is none; of a reader, at its last `state`."""
         return self.state(look=False).last
-
-    @property
-    def newest(self) -> int | None:
-        """The number of the newest checkpoint, None when there is none; of a reader, at its last `state`."""
-        return self.state(look=False).newest
 
     @property
     def compacted(self) -> int:
@@ -418,17 +409,13 @@ class Store:
     def _rows_behind(self, after: int, *, arrays: bool) -> Iterator[Head]:
         with self._using("looking for rows"):
             last = self._rows.last
-
-        def rows(after: int) -> Iterator[Head]:
-            while after < last:
-                with self._using(f"reading rows behind {after}"):
-                    head = self._row_behind(after, last, arrays=arrays)
-                if head is None:
-                    return  # those that are left gave up their arrays, and a repair left them out
-                yield head
-                after = head.sequence
-
-        return rows(after)
+        while after < last:
+            with self._using(f"reading rows behind {after}"):
+                head = self._row_behind(after, last, arrays=arrays)
+            if head is None:
+                return  # those that are left gave up their arrays, and a repair left them out
+            yield head
+            after = head.sequence
 
     def _row_behind(self, after: int, last: int, *, arrays: bool) -> Head | None:
         """Return the first row behind one and up to `last`, verified, None where there is none; arrays: as a record.
@@ -549,7 +536,7 @@ class Store:
             if earlier is not None:
                 earlier.cancel()
 
-    def _draft(self, arrays: Arrays, last_sequence: int, attributes: Attributes) -> CheckpointDraft:
+    def _draft(self, arrays: Arrays, last_sequence: int, attributes: Attributes) -> Checkpoint:
         self._check_open(write=True)
         self._refuse_in_batch("committing a checkpoint")  # its rows may yet be rolled back
         first, last = self._settled().compacted, self._rows.last
@@ -559,9 +546,9 @@ class Store:
             raise RecordError(f"{what}, not {last_sequence!r}")
         if reserved := [name for name in arrays if name.startswith(INDEX)]:
             raise RecordError(f"no array may be called {reserved[0]!r}: {INDEX!r} begins the names of the store's own")
-        return CheckpointDraft(check_arrays(arrays), last_sequence, to_json("attributes", attributes))
+        return Checkpoint(0, last_sequence, from_json(to_json("attributes", attributes)), check_arrays(arrays))
 
-    def _commit(self, draft: CheckpointDraft) -> int:
+    def _commit(self, draft: Checkpoint) -> int:
         with self._committing:
             with self._using("looking where rows are"):
                 log, place = self._current.log_identity, self._rows.place(self._log, draft.last_sequence)
@@ -576,14 +563,13 @@ class Store:
             self._remove_unnamed()
             return named.number
 
-    def _write(self, draft: CheckpointDraft, place: LogPlace, log: bytes, table: np.ndarray) -> NamedCheckpoint:
+    def _write(self, draft: Checkpoint, place: LogPlace, log: bytes, table: np.ndarray) -> NamedCheckpoint:
         """Write a draft, with which rows are where in a log."""
         number = 1 + max(numbers(self._folder, CHECKPOINT, PARTIAL), default=0)
-        draft = replace(draft, arrays={**draft.arrays, index_name(log): table})
-        sha256 = write_checkpoint(self._folder, number, draft, self.identity)
-        return NamedCheckpoint(number, draft.last_sequence, sha256, place)
+        draft = replace(draft, number=number, arrays={**draft.arrays, index_name(log): table})
+        return NamedCheckpoint(number, draft.last_sequence, write_checkpoint(self._folder, draft, self.identity), place)
 
-    def _commit_later(self, draft: CheckpointDraft) -> None:
+    def _commit_later(self, draft: Checkpoint) -> None:
         try:
             self._commit(draft)
         except Exception as error:
@@ -653,7 +639,7 @@ class Store:
             # This opens the log that took its place. Where it cannot, whoever uses the store next does, or learns why.
             self._remove_unnamed()
 
-    def _compacted(self, drafts: list[CheckpointDraft]) -> Current:
+    def _compacted(self, drafts: list[Checkpoint]) -> Current:
         """Write a log in which rows have no arrays, and the checkpoints that stand for them; read all of it back."""
         number = 1 + max(numbers(self._folder, LOG, NEW), default=0)
         path = log_path(self._folder, number)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from os import PathLike
@@ -12,7 +13,7 @@ from scroll_tactile_store.archive import unpacked
 from scroll_tactile_store.checkpoint_files import INDEX, CheckpointReader, index_name
 from scroll_tactile_store.encoding import decode_payload
 from scroll_tactile_store.exceptions import DamageError, NotAStoreError, reported
-from scroll_tactile_store.files import is_file, store_folder
+from scroll_tactile_store.files import store_folder
 from scroll_tactile_store.framing import FRAME_BYTES, Frame
 from scroll_tactile_store.layout import (
     CHECKPOINT,
@@ -27,7 +28,6 @@ from scroll_tactile_store.layout import (
     log_path,
     numbers,
     read_current,
-    require_safe,
     unnamed,
 )
 from scroll_tactile_store.log import BEGIN, Log
@@ -65,34 +65,25 @@ def check_store(path: str | PathLike[str], *, progress: Progress | None = None) 
     where a file cannot be read for a reason that says nothing against it.
     """
     folder = store_folder(path)
-    if is_file(folder):
+    if os.path.isfile(folder):
         try:
             with unpacked(folder) as inside:
                 return [replace(problem, path=folder) for problem in check_store(inside, progress=progress)]
         except DamageError as error:
             return [Problem(folder, str(error), "lost")]
     with reported(folder, "checking the store"):
-        require_store(folder)
         try:
-            require_safe(folder)
+            if not holds_store(folder):
+                raise NotAStoreError(f"{folder} holds no store")
         except DamageError as error:
             return [Problem(error.path, str(error), "lost")]
         for _ in range(ATTEMPTS):
             survey = Survey(folder, progress or (lambda *_: None))
             survey.close()
-            found = survey.problems()
+            found = survey.problems
             if not found or survey.current == current_of(folder):
                 break
         return found + survey.leftovers()
-
-
-def require_store(folder: Path) -> None:
-    """Return where `folder` holds a store, or what is left of one. Raises NotAStoreError and VersionError."""
-    try:
-        if not holds_store(folder):
-            raise NotAStoreError(f"{folder} holds no store")
-    except DamageError:
-        return
 
 
 def current_of(folder: Path) -> Current | None:
@@ -110,7 +101,8 @@ class Survey:
     checkpoints count. `path` is the log's, and `log` it, None where nothing of it can be read. `rows` are the offsets
     and sizes of its rows' frames by sequence, ascending; `last` is the last sequence of which there is any sign;
     `compacted` the last row whose arrays compaction gave up. `sound` are the checkpoints that recovery can resume from,
-    the newest first, `spoilt` the others. `identity` is None where it is lost. A writer may be at work meanwhile.
+    the newest first, `spoilt` the others; `problems` what is damaged. `identity` is None where it is lost. A writer may
+    be at work.
 
     Raises VersionError for another format, and StoreError for a file that cannot be read for a reason that says
     nothing against it.
@@ -118,7 +110,7 @@ class Survey:
 
     def __init__(self, folder: Path, progress: Progress) -> None:
         self.folder, self.progress = folder, progress
-        self._problems: list[Problem] = []
+        self.problems: list[Problem] = []
         self._faults: list[tuple[int, int, str]] = []  # first row, last row, what is wrong
         self.rows: dict[int, tuple[int, int]] = {}
         self.log: Log | None = None
@@ -135,21 +127,16 @@ class Survey:
         except BaseException:
             self.close()
             raise
-        known = [self._known, self._end + self._is_torn, *(each.last_sequence for each in self.sound)]
-        self.last = max(known + ([] if current is None else [each.last_sequence for each in current.checkpoints]))
+        checkpoints = self.sound if current is None else current.checkpoints
+        self.last = max(self._known, self._end + self._is_torn, *(each.last_sequence for each in checkpoints))
         self._note_gap(self.last)
-        self._problems += [
-            Problem(self.path, f"{what} in {self.path}", "lost") for _, what in self.faulty(1, self.last)
-        ]
+        for _, what in self.faulty(1, self.last):
+            self._note(self.path, f"{what} in {self.path}", "lost")
         if self.identity is None:
             self._note(folder, f"nothing in {folder} tells what the store is for", "lost")
 
     def _note(self, path: Path, what: object, kind: Literal["lost", "spare"]) -> None:
-        self._problems.append(Problem(path, str(what), kind))
-
-    def problems(self) -> list[Problem]:
-        """Return what is damaged."""
-        return self._problems
+        self.problems.append(Problem(path, str(what), kind))
 
     def close(self) -> None:
         """Close the log."""
@@ -176,12 +163,8 @@ class Survey:
         current = self.current
         try:
             log = self.log = Log(self.path, identity=None if current is None else current.log_identity)
-            if current is not None and log.identity != current.log_identity:
-                raise DamageError(f"{self.path} is the log of another store, or of another time", path=self.path)
         except (DamageError, FileNotFoundError) as error:  # nothing of it is read
-            self._note(self.path, error if isinstance(error, DamageError) else f"{self.path} is gone", "lost")
-            self.close()
-            self.log = None
+            self._note(self.path, error, "lost")
             return
         try:
             if log.header_damage is not None:
@@ -214,7 +197,7 @@ class Survey:
                 continue
             what = None
             try:
-                if (payload := decode_row(data).payload) is not None:
+                if (payload := decode_row(data)[1]) is not None:
                     decode_payload(payload)
                 elif self.current is None:
                     self.compacted = sequence

@@ -23,7 +23,7 @@ from scroll_tactile.persistence import ledger, merge, replaying
 
 @bug("a frame's payload is not verified", log.Log, "_payload")
 def _payload_as_it_is(_: Any, self: Any, frame: Any, begin: bytes) -> Any:
-    return self.at(frame.payload_offset, frame.size)
+    return self.at(frame.offset + log.FRAME_BYTES, frame.size)
 
 
 @bug("CURRENT is not verified", layout.Current, "from_bytes")

@@ -90,7 +90,7 @@ class TestSources:
         [
             ({"material": "a", "by": "file"}, InputError, "in one way"),
             ({"material": ""}, MaterialError, "1 to 200"),
-            ({"by": "folder:x"}, InputError, "or 'folder:2'; came 'folder:x'"),
+            ({"by": "folder:x"}, InputError, "'folder:2' or 'group:2'; came 'folder:x'"),
             ({"preset": "biotacc"}, InputError, "expected a preset"),
             ({"columns": "25-44"}, FieldError, "such as 25:44 or 0,3,5:9, counted from 0; came '25-44'"),
             ({"cut": "intervals"}, InputError, "takes intervals=, a table"),

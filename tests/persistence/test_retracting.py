@@ -175,7 +175,7 @@ def test_a_compaction_checkpoint_is_gone_on_from_where_all_else_is_lost(path, ca
     require_same(learner, expected)
     learner._ledger.store.close()  # as if the power failed
     with Store.open(path) as store:
-        newest, compaction = store.newest, store.compaction().number
+        newest, compaction = store.state().newest, store.compaction().number
     assert newest != compaction
     spoil(path, newest)
     with TactileLearner.open(path, **SETTINGS) as learner:

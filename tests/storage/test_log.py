@@ -68,13 +68,13 @@ def whole(tmp_path_factory):
 
 
 def cut(log):
-    for size in range(0, len(log.data), 5):
+    for size in range(0, len(log.data), 7):
         yield log.data[:size], log.committed(size), None if size >= log.begin else (0, 0)
 
 
 def flipped(log):
     """But in the last batch, where it looks as after a power cut."""
-    for place in range(0, len(log.data), 7):
+    for place in range(0, len(log.data), 11):
         data = bytearray(log.data)
         data[place] ^= 1 << place % 8
         index = next(index for index, frame in enumerate(log.frames) if place < frame.end)

@@ -24,11 +24,11 @@ class Gate:
         self.write = scroll_tactile_store.store.write_checkpoint
         monkeypatch.setattr(scroll_tactile_store.store, "write_checkpoint", self)
 
-    def __call__(self, parent, number, draft, identity):
-        self.last_sequences.append(draft.last_sequence)
+    def __call__(self, *given):
+        self.last_sequences += [each.last_sequence for each in given if hasattr(each, "last_sequence")]
         self.reached.set()
         assert self.open.wait(10)
-        return self.write(parent, number, draft, identity)
+        return self.write(*given)
 
 
 def test_appends_go_on_the_newest_waiting_commit_wins_and_others_wait(opened, monkeypatch):

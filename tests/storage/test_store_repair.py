@@ -290,11 +290,13 @@ class KilledError(BaseException):
 
 
 def killed_at(monkeypatch, step):
-    """Kill what is done before or after its step of this number: a rename, a sync or a removal."""
-    steps = itertools.count(1)
+    """Kill what is done before or after its step of this number: a rename, a sync or a removal; all steps so far."""
+    steps = []
 
     def killing(real, *args, **options):
-        if (number := next(steps)) == step and step % 2:
+        steps.append(real)
+        number = len(steps)
+        if number == step and step % 2:
             raise KilledError
         done = real(*args, **options)
         if number == step:
@@ -303,6 +305,7 @@ def killed_at(monkeypatch, step):
 
     for name in ("rename", "replace", "fsync", "unlink", "rmdir"):
         monkeypatch.setattr(os, name, partial(killing, getattr(os, name)))
+    return steps
 
 
 @pytest.mark.parametrize("how", ["no log", "all but the log"])
@@ -320,12 +323,11 @@ def test_killed_at_any_step_it_can_be_begun_again(stores, tmp_path, monkeypatch,
     for interrupted in itertools.count():
         path = shutil.copytree(source, tmp_path / str(interrupted))
         with monkeypatch.context() as broken:
-            killed_at(broken, interrupted + 1)
-            try:
+            steps = killed_at(broken, interrupted + 1)
+            with suppress(KilledError):
                 repair_store(path)
-                break
-            except KilledError:
-                pass
+        if len(steps) <= interrupted:
+            break
         # Whoever opens it now finds a store, or is told to repair it; and never another one.
         for mode in ("read", "write"):
             with suppress(DamageError), Store.open(path, mode=mode, identity={"for": "another"}) as opened:

@@ -127,7 +127,7 @@ def learn(
         raise InputError(f"expected workers as a whole number of 1 or more; came {workers!r}")
     if executor is not None and not isinstance(executor, Executor):
         raise InputError(f"expected an Executor, such as client.get_executor() of Dask; came {type(executor).__name__}")
-    begun, place = time.perf_counter(), Path(memory).absolute()
+    begun, place = time.perf_counter(), Path(memory).expanduser().absolute()
     paths = [os.fspath(source) for source in sources]
     found, missing = find_sources(paths)
     options = (options or SourceOptions()).among(found, paths)

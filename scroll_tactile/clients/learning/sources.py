@@ -135,22 +135,26 @@ class SourceOptions:
         require_found(self.intervals or (), files)
         placed = replace(self, tops=tuple(paths))
         if self.by == "folder":
-            placed._require_folders([placed.folders(source) for source in files])
+            placed._require_folders(files)
         return placed
 
     def folders(self, source: str) -> list[str]:
         """The folders from the path that was typed down to a source; those in its path where it was typed itself."""
-        own = _parts(source)[:-1]
-        tops = (_parts(top) for top in self.tops)
-        below = own[max((len(top) for top in tops if own[: len(top)] == top), default=0) :]
-        return below or own[-1:]
+        own, top = _parts(source)[:-1], self._top(source)
+        return own[len(top) :] or own[-1:]
 
-    def _require_folders(self, found: Sequence[list[str]]) -> None:
-        above: dict[str, set[tuple[str, ...]]] = {}
-        for folders in filter(None, found):
-            above.setdefault(folders[-1], set()).add(tuple(folders[:-1]))
-        numbers = [name for name in above if not any(map(str.isalpha, name))]
-        several = [name for name, places in above.items() if len(places) > 1]
+    def _top(self, source: str) -> list[str]:
+        own, tops = _parts(source)[:-1], map(_parts, self.tops)
+        return max((top for top in tops if own[: len(top)] == top), key=len, default=[])
+
+    def _require_folders(self, sources: Sequence[str]) -> None:
+        found = [self.folders(source) for source in sources]
+        places: dict[tuple[str, str], set[str]] = {}  # of a name below each path that was typed
+        for source, folders in zip(sources, found, strict=True):
+            if folders:
+                places.setdefault((folders[-1], "/".join(self._top(source))), set()).add("/".join(folders[:-1]))
+        numbers = [name for name, _ in places if not any(map(str.isalpha, name))]
+        several = [name for (name, _), above in places.items() if len(above) > 1]
         if not numbers and not several:
             return
         why = f"{numbers[0]!r} is a number" if numbers else f"{several[0]!r} lies in several folders"

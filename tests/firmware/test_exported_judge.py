@@ -118,68 +118,42 @@ int main(void)
     touch_memory_answer(&answer);
     fwrite(&answer.novelty, sizeof answer.novelty, 1, stdout);
     fwrite(answer.scores, sizeof *answer.scores, TOUCH_MEMORY_MATERIALS, stdout);
-    printf("%s %g %d", TOUCH_MEMORY_DIGEST, TOUCH_MEMORY_RATE, (int)answer.material);
+    printf("%s %g %d ", TOUCH_MEMORY_DIGEST, TOUCH_MEMORY_RATE, (int)answer.material);
+    fwrite(TOUCH_MEMORY_SENSOR, sizeof TOUCH_MEMORY_SENSOR, 1, stdout);
+    for (int m = 0; m < TOUCH_MEMORY_MATERIALS; m++)
+        puts(touch_memory_names[m]);
 }
 """
-NAMED = """#include <stdio.h>
-#include "touch_memory.h"
-int main(void)
-{
-    const size_t size = sizeof TOUCH_MEMORY_SENSOR - 1;
-    fwrite(TOUCH_MEMORY_SENSOR, 1, size, stdout);
-    fwrite(touch_memory_names[0], 1, size, stdout);
-}
-"""
+ODD = ('"quoted"\\', "*/ int x; /*", "naïve 0??/\n#error\\\r", "\u202e％d%s" + 3000 * "Ω")
 C99, CPP = ("gcc", "-x", "c", "-std=c99"), ("g++", "-x", "c++", "-std=c++17")
 CLANG, PP = ("clang", *C99[1:]), ("clang++", *CPP[1:])
 WAYS = {"c": (C99, C99), "c from c++": (C99, CPP), "c++": (CPP, CPP), "clang": (CLANG, CLANG), "clang++": (CLANG, PP)}
 
 
-def built(folder, judge, program, engine, caller):
-    """A program that calls what was exported of a judge; nothing in it is warned of."""
-    if any(shutil.which(way[0]) is None for way in (engine, caller)):
-        pytest.skip(f"{engine[0]} or {caller[0]} is not there")
-    write_firmware(judge, folder, [])
-    (folder / "caller.c").write_text(program)
-    for name in ("main", "touch_memory", "judge", "kernels", "caller"):
-        way = caller if name == "caller" else engine
-        subprocess.run([*way, *STRICT, "-c", f"{name}.c"], cwd=folder, check=True)
-    objects = ["touch_memory.o", "judge.o", "kernels.o", "caller.o"]
-    subprocess.run([caller[0], *objects, "-o", "caller"], cwd=folder, check=True)
-    return folder / "caller"
-
-
 @pytest.mark.parametrize("way", WAYS)
-def test_c_and_cpp_take_values_in_the_sensors_unit_as_python(exports, tmp_path, way):
-    _, judge, scene, learner = exports["pad"]
+def test_c_and_cpp_take_values_in_the_sensors_unit_as_python_and_names_of_anything(exports, tmp_path, way):
+    if any(shutil.which(compiler) is None for compiler, *_ in WAYS[way]):
+        pytest.skip(f"{way} is not there")
+    _, whole, scene, learner = exports["pad"]
+    judge = replace(whole, materials=ODD, sensor=whole.sensor.model_copy(update={"name": "\0".join(ODD)}))
     low, high = judge.sensor.limits
     random, ties = np.random.default_rng(0).random((2, 4000, 3))
     span, ties = high - low, np.rint(4096 * ties) / 4096 + 1 / 8192
     values = [scene.touch(scene.materials[0], 9).readings, low + span * ties, low + span * (1.2 * random - 0.1)]
     values = np.concatenate([*values, [low, high]]).astype(np.float32)
     levels = replace(judge, capacity=len(values)).levels(values)
-    lost = np.array([[np.nan, np.inf, -np.inf]], np.float32)
+    answer, lost = judge.answer(levels), np.array([[np.nan, np.inf, -np.inf]], np.float32)
+    write_firmware(judge, tmp_path, [])
+    (tmp_path / "caller.c").write_text(CALLER)
+    for name in ("main", "touch_memory", "judge", "kernels", "caller"):
+        subprocess.run([*WAYS[way][name == "caller"], *STRICT, "-c", f"{name}.c"], cwd=tmp_path, check=True)
+    objects = ["touch_memory.o", "judge.o", "kernels.o", "caller.o"]
+    subprocess.run([WAYS[way][1][0], *objects, "-o", "caller"], cwd=tmp_path, check=True)
     given = values.tobytes() + lost.tobytes()
-    program = built(tmp_path, judge, CALLER, *WAYS[way])
-    came = subprocess.run([program], input=given, capture_output=True, check=True).stdout
-    answer, size = judge.answer(levels), levels.nbytes
-    assert np.array_equal(np.frombuffer(came[:size], np.int16).reshape(levels.shape), levels)
-    assert np.frombuffer(came[size:][:6], np.int16).tolist() == [MISSING_LEVEL] * 3
-    assert np.frombuffer(came[size + 6 :][:40], np.int64).tolist() == [answer.novelty, *answer.scores]
-    assert came[size + 46 :].decode() == f"{learner.digest()} 99.9 {judge.materials.index(answer.material)}"
-
-
-@pytest.mark.parametrize(
-    "name", ['"quoted"\\', "*/ int x; /*", "naïve 0??/", "a\nb\r#error\\", "\0nul", "\u202e％d%s", "Ω" * 3000]
-)
-def test_names_of_anything_are_strings_in_c(exports, tmp_path, name):
-    whole = exports["pad"][1]
-    sensor = whole.sensor.model_copy(update={"name": name})
-    judge = replace(whole, sensor=sensor, materials=(name, *whole.materials[1:]))
-    for way in (C99, CPP):
-        folder = tmp_path / way[0]
-        came = subprocess.run([built(folder, judge, NAMED, way, way)], capture_output=True, check=True).stdout
-        assert came == name.encode() * 2
+    came = subprocess.run([tmp_path / "caller"], input=given, capture_output=True, check=True).stdout
+    expected = [np.append(levels, np.full(3, MISSING_LEVEL, np.int16)), np.array([answer.novelty, *answer.scores])]
+    said = f"{learner.digest()} 99.9 {ODD.index(answer.material)} {judge.sensor.name}\0" + "\n".join((*ODD, ""))
+    assert came == b"".join(part.tobytes() for part in expected) + said.encode()
 
 
 @pytest.mark.parametrize("kind", ["pad", "roboskin"])

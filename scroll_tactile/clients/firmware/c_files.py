@@ -163,10 +163,6 @@ enum {{
     TOUCH_MEMORY_MATERIALS = {len(judge.materials)}
 }};
 
-/* The level of a value in the sensor's unit, in float arithmetic; NaN and infinity count as not read. */
-#define touch_memory_level(channel, value) \\
-    tactile_level(touch_memory_low[channel], touch_memory_high[channel], value)
-
 #ifdef __cplusplus
 extern "C" {{
 #endif
@@ -174,6 +170,12 @@ extern "C" {{
 /* Names by the number in an answer, in UTF-8; and the range of each channel, in the sensor's unit. */
 extern const char *const touch_memory_names[TOUCH_MEMORY_MATERIALS];
 extern const float touch_memory_low[TOUCH_MEMORY_CHANNELS], touch_memory_high[TOUCH_MEMORY_CHANNELS];
+
+/* The level of a value in the sensor's unit, in float arithmetic; NaN and infinity count as not read. */
+static inline int16_t touch_memory_level(int32_t channel, float value)
+{{
+    return tactile_level(touch_memory_low[channel], touch_memory_high[channel], value);
+}}
 
 void touch_memory_begin(void);
 

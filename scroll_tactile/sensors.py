@@ -70,7 +70,7 @@ class Sensor(BaseModel):
     layout: tuple[Annotated[int, Field(ge=1)], ...] | None = None
     camera: bool = False
     non_finite: Literal["refused", "missing"] = "refused"
-    columns: tuple[str, ...] | None = None
+    columns: Annotated[tuple[str, ...] | None, Field(repr=False)] = None
 
     def __init__(self, **fields: Any) -> None:
         try:

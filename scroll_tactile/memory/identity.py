@@ -171,11 +171,12 @@ class Identity(_Kept):
 def differences(part: str, there: Any, here: Any) -> str:
     """In which fields a part of an identity differs from another, in words; "" where it does not.
 
-    Of an embedding its configuration does not count: a file of weights may have any name.
+    Of an embedding its configuration does not count: a file of weights may have any name. Nor does what a sensor's
+    columns are called.
     """
     if not isinstance(there, BaseModel):
         return "" if there == here else f"{part} {there!r} there, {here!r} here"
-    names = [name for name in type(there).model_fields if name != "configuration"]
+    names = [name for name in type(there).model_fields if name not in ("configuration", "columns")]
     return "; ".join(filter(None, (differences(name, getattr(there, name), getattr(here, name)) for name in names)))
 
 

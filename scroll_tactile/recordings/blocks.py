@@ -23,9 +23,13 @@ _MESSAGE = 8000  # letters of an error
 _ROWS = 4096  # of a block …
 _BYTES = 1 << 24  # … unless they would hold more than this
 _TIME = re.compile(
-    r"(?:time(?:[ _]?stamp)?s?|t|ts|stamps?|seconds)(?:[ _]*[\[(]?(s|sec|seconds|ms|us|µs|ns)[\])]?)?", re.IGNORECASE
+    r"[\W_]*(?:(?:ros|rosbag|bag|unix|log|host|pc|sys(?:tem)?|device|sensor|elapsed|rel(?:ative)?|epoch|header|recv)"
+    r"[ _-]*)?(?:time(?:[ _-]*stamps?)?s?|stamps?|ts?|seconds|n?secs?|nanosec|date[ _]?time|millis|micros|x_value)"
+    r"(?:\(\))?(?:[ _-]+(\w+)|[ _-]*[\[(] ?(\w+) ?[\])])?",
+    re.IGNORECASE,
 )
-_UNITS = {"ms": 1e3, "us": 1e6, "µs": 1e6, "ns": 1e9}
+_UNIT = re.compile(r"(m|u|µ|μ|n|milli|micro|nano)?s(?:ec(?:ond)?s?)?|(millis|micros|x_value)(?:\(\))?", re.IGNORECASE)
+_FACTORS = {"": 1.0, "m": 1e3, "milli": 1e3, "millis": 1e3, "n": 1e9, "nano": 1e9}  # and a million of the others
 
 
 @dataclass(frozen=True)
@@ -188,18 +192,30 @@ def floats(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 def is_clock(name: str) -> bool:
-    """Whether a column or array is called as times are: time, timestamps, t_ms, "stamp [ns]" …"""
-    return _TIME.fullmatch(name) is not None
+    """Whether a column, array or key is called as times are: t, timestamp_ns, `Time [ms]`, `__time`, `header.stamp`."""
+    match = _TIME.fullmatch(_last(name))
+    return match is not None and _unit(match[1] or match[2] or "s") > 0
 
 
-def in_seconds(times: npt.NDArray[Any], name: str) -> npt.NDArray[np.float64]:
-    """Times in seconds, by their own type, by the unit in their name, or as ms, µs or ns since 1970 by their size."""
+def in_seconds(times: npt.NDArray[Any], name: str, unit: str = "") -> npt.NDArray[np.float64]:
+    """Times in seconds, by their own type, by the unit in their name or beside it, or by their size since 1970."""
     if times.dtype.kind in "mM":
         return times.astype(f"{times.dtype.kind}8[ns]").astype(np.int64) / 1e9
-    if (match := _TIME.fullmatch(name)) and match[1]:
-        return times / _UNITS.get(match[1].lower(), 1.0)
+    name = _last(name)
+    match = _TIME.fullmatch(name)
+    named = _unit((match and (match[1] or match[2])) or unit) or (_unit(name) if name[:2].lower() == "mi" else 0.0)
     largest = float(np.nanmax(np.abs(times.astype(np.float64)), initial=0.0))
-    return times / next((factor for size, factor in ((1e17, 1e9), (1e14, 1e6), (1e11, 1e3)) if largest > size), 1.0)
+    return times / (named or next((by for size, by in ((1e17, 1e9), (1e14, 1e6), (1e11, 1e3)) if largest > size), 1.0))
+
+
+def _last(name: str) -> str:
+    return re.split("[./]", name.strip())[-1]
+
+
+def _unit(text: str) -> float:
+    """How many of a unit of time make a second; 0 for what is none."""
+    match = _UNIT.fullmatch(text.strip("[]() "))
+    return 0.0 if match is None else _FACTORS.get((match[1] or match[2] or "").lower(), 1e6)
 
 
 @contextmanager

@@ -13,9 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import FieldError, RecordingError, ScrollTactileError
-from scroll_tactile.recordings.blocks import Block, Contents, Entry, Request, rows_of
+from scroll_tactile.recordings.blocks import Block, Contents, Entry, Request, in_seconds, is_clock, rows_of
 from scroll_tactile.recordings.paths import nearest
-from scroll_tactile.recordings.text import FEWEST, LONGEST, Layout, Text, in_seconds, is_time, moment, number, usual
+from scroll_tactile.recordings.text import FEWEST, LONGEST, Layout, Text, moment, number, usual
 
 __all__ = ["LONGEST", "SUFFIXES", "Delimited"]
 
@@ -23,6 +23,7 @@ SUFFIXES = (".csv", ".tsv", ".txt", ".dat")
 
 _MOST_COLUMNS = 1 << 18  # a picture of 320 × 240 in three colours has 230 400
 _SEEN, _SEEN_TEXT = 200, 1 << 20  # lines, and characters of them, are looked at to say what a table is
+_SAMPLE = 32  # of these lines say what separates cells
 _SEPARATED = re.compile(r'"?sep=(.)"?', re.IGNORECASE)
 _COUNTS = frozenset(("", "index", "idx", "unnamed: 0", "frame", "frame_index", "seq", "sequence", "sample", "row"))
 _UNIT = re.compile(
@@ -54,7 +55,7 @@ class Delimited(Text):
         if not head:
             raise RecordingError(f"expected readings in {address}, one row each; there are none")
         lines = [line for _, line in head if not line.startswith(("#", "%"))] or [line for _, line in head]
-        self.layout = Layout.of(lines, delimiter, request.decimal)
+        self.layout = Layout.of(lines[-_SAMPLE:], delimiter, request.decimal)
         rows = [(row, line, self.layout.cells(line)) for row, line in head]
         self.width = usual([self.layout.cells(line) for line in lines])
         if self.width > _MOST_COLUMNS:
@@ -67,9 +68,9 @@ class Delimited(Text):
         """Whether it is a table of numbers, where it may be any text by its name."""
         if path.suffix.lower() in SUFFIXES[:2]:
             return True
-        with suppress(ScrollTactileError, StopIteration, OSError):
+        with suppress(ScrollTactileError, OSError, ValueError):
             table = cls(path, str(path), Request())
-            return table.numbers == table.chosen and len(next(table.blocks()).readings) >= FEWEST
+            return table.numbers == table.chosen and table.looked >= FEWEST
         return False
 
     def field(self) -> str:
@@ -209,23 +210,24 @@ class Delimited(Text):
         same = [cells for _, _, cells in rows if len(cells) == self.width]
         if self.layout.delimiter != " " and self.width > 1 and not any(cells[-1].strip() for cells in same):
             self.width -= 1  # a delimiter stands behind each row
-        sure = same[2 * len(same) // 3 :][-max(3, _MOST_COLUMNS // self.width) :]
+        sure = same[2 * len(same) // 3 :][-min(_SAMPLE, max(3, _MOST_COLUMNS // self.width)) :]
         numeric = [2 * sum(number(c[i], point) is not None for c in sure) > len(sure) for i in range(self.width)]
         above: list[list[str]] = []
-        for self.begin, line, cells in rows:
+        for i, (self.begin, line, cells) in enumerate(rows):
             if line.startswith(("#", "%")) and len(cells) != self.width:
                 cells = self.layout.cells(line.lstrip("#% "))  # noqa: PLW2901
-            elif (above and not any(numeric)) or not (
-                self._heads(cells, numeric) if header is None else header and not above
-            ):
-                break
+            elif header is not None or (above and not any(numeric)):
+                if not header or above:
+                    break
+            elif not self._heads(cells, numeric):
+                texts = any(number(cell, point) is None for cell in cells)
+                if not texts or not any(self._heads(own, numeric) for _, _, own in rows[i + 1 : i + 4]):
+                    break  # unless it is in a preamble, which goes on behind it
             above.append(cells)
         else:
             self.begin += 1
         data = [cells for row, _, cells in rows if row >= self.begin and self.width <= len(cells) <= self.width + 1]
-        named = [
-            cells for cells in above if len(cells) == self.width or (len(cells) == self.width + 1 and not cells[-1])
-        ]
+        named = [cells for cells in above if self.width <= len(cells) <= self.width + 1]
         if header is None and not named and data and self._counts(data):
             named, self.begin = [data.pop(0)], self.begin + 1
         units = next((cells for cells in named if len(named) > 1 and _are_units(cells)), None)
@@ -234,13 +236,13 @@ class Delimited(Text):
         self.units = (units or [""] * self.width)[: self.width]
         self.columns = [self.named(name) for name in (names or map(str, range(self.width)))][: self.width]
         self.columns[0] = self.columns[0].lstrip("#% ")
-        if odd := len(above) - len(named):
-            self.notes.append(f"{odd} rows above the numbers name no column")
+        if others := len(above) - len(named):
+            self.notes.append(f"{others} rows above the numbers name no column")
         self._assign(data, numeric)
 
     def _assign(self, data: list[list[str]], numeric: list[bool]) -> None:
         """Which columns are times, labels and readings, by the first rows of numbers; others are left out."""
-        own = data[:-1] if self.unended else data
+        own, self.looked = data[:-1] if self.unended else data, len(data)
         last = [cells[self.width - 1].strip() for cells in own] if len(own) > FEWEST else [""]
         self.tail = usual([cell.partition(self.layout.decimal)[2] for cell in last])  # decimals of the last column
         self.time = None if self.request.clock is None else self._column(self.request.clock)
@@ -248,7 +250,7 @@ class Delimited(Text):
         for i, name in enumerate(self.columns if self.header else []):
             if name.lower() == "date":
                 apart.append(i)
-            elif is_time(name):
+            elif is_clock(name):
                 told = sum(moment(cells[i], self.layout.decimal) is not None for cells in own)
                 if self.time is None and 2 * told >= len(own):
                     self.time = i
@@ -313,7 +315,8 @@ class Delimited(Text):
 def _count(cells: Iterable[str]) -> bool:
     """Whether each cell is one more than that before."""
     found = [cell.strip() for cell in cells]
-    return bool(found) and found[0].isdigit() and found == [str(int(found[0]) + i) for i in range(len(found))]
+    first = int(found[0]) if found and re.fullmatch("[0-9]{1,18}", found[0]) else None
+    return first is not None and found == [str(first + i) for i in range(len(found))]
 
 
 def _are_units(cells: list[str]) -> bool:

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from scroll_tactile.errors import FieldError, RecordingError, ScrollTactileError
-from scroll_tactile.recordings.blocks import Block, Contents, Entry, Request, rows_of
+from scroll_tactile.recordings.blocks import Block, Contents, Entry, Request, in_seconds, is_clock, rows_of
 from scroll_tactile.recordings.paths import FieldPath
-from scroll_tactile.recordings.text import FEWEST, Text, in_seconds, is_time, moment
+from scroll_tactile.recordings.text import FEWEST, Text, moment
 
 __all__ = ["SUFFIXES", "JsonFile"]
 
@@ -121,6 +121,7 @@ class JsonFile(Text):
                     label = name if self.request.labels is None else self._found(message, self.request.labels)[0]
                     if several and (f"{row} {place}" if place else "", label) != before:
                         before, number, index = (f"{row} {place}" if place else "", label), number + 1, 0
+                        self.paths[number] = place.replace(".", "/")
                         self.names |= {number: self.named(label)} if isinstance(label, str) and label.strip() else {}
                     yield (*taken, number, index)
                     index += 1
@@ -143,7 +144,7 @@ class JsonFile(Text):
 
     def _time(self, message: Any, times: list[Any]) -> float | None:
         if self.clock is None and isinstance(message, dict):
-            self.clock = next((key for key in message if is_time(key)), "")
+            self.clock = next((key for key in message if is_clock(key)), "")
         found = self._found(message, self.clock) if self.clock and isinstance(message, dict) else times
         time = found[0] if found else None
         if found and not isinstance(time, float) and (time := moment(str(found[0]))) is None:
@@ -215,7 +216,7 @@ def _lists(value: Any, leads: Callable[[str, list[Any]], bool], place: str = "")
             for i, inner in enumerate(value):
                 yield from _lists(inner, leads, f"{place}[{i}]") if isinstance(inner, dict | list) else ()
     elif isinstance(value, dict):
-        times = next((own for key, own in value.items() if is_time(key) and isinstance(own, list)), [])
+        times = next((own for key, own in value.items() if is_clock(key) and isinstance(own, list)), [])
         name = next((value[key] for key in _NAMES if isinstance(value.get(key), str)), None)
         for key, inner in value.items():
             for at, rows, own, called in _lists(inner, leads, f"{place}.{key}" if place else key):
@@ -246,7 +247,7 @@ def _leaves(value: Any, before: str) -> Iterator[tuple[str, tuple[int, ...]]]:
     start, alone = f"{before}." if before else "", []
     for key, inner in value.items():
         if isinstance(inner, int | float):
-            alone += [key] if key.isidentifier() and not is_time(key) and key not in _COUNTERS else []
+            alone += [key] if key.isidentifier() and not is_clock(key) and key not in _COUNTERS else []
         elif _are_rows(inner):
             yield from ((name, (len(inner), *shape)) for name, shape in _leaves(inner[0], f"{start}{key}[*]"))
         elif inner:

@@ -55,13 +55,13 @@ def read(
     """All readings of a file, or of a folder that is one recording.
 
     path: a ROS 1 `.bag`; a ROS 2 `.db3` or `.mcap`, or the folder of a bag; a LeRobotDataset v2 or v3; `.parquet`
-        and `.feather`; HDF5, as robomimic's; a Zarr replay buffer; `.npy`, `.npz` and `.mat`; a table of text, `.csv`;
-        `.json` and `.jsonl`. Bags in a folder whose names differ in a last number alone are one that was split. On this
-        machine, or an address that fsspec knows.
-    topic, field: where the numbers are. Of messages `field` is a path such as `tactiles[0].electrodes`, see `paths`; of
-        tables it names columns (`e1:e19`, `e*`, `a,b`), of others an array, with an index behind it (`[0:19]`); arrays
-        that a pattern finds in several groups (`run/*/tactile`), and entries of a stack (`x[*]`), are episodes, see
-        `arraystores`.
+        and `.feather`; HDF5, as robomimic's; a Zarr replay buffer; `.npy`, `.npz` and `.mat`; tables of
+        text, `.csv`, `.tsv`, `.txt` and `.dat`; JSON and lines of JSON. Bags in a folder whose names differ in a last
+        number alone are one that was split. On this machine, or an address that fsspec knows.
+    topic, field: where the numbers are. Of messages and JSON `field` is a path such as `tactiles[0].electrodes`, see
+        `paths`; of tables it names columns (`e1:e19`, `e*`, `a,b`), of others an array, with an index behind it
+        (`[0:19]`); arrays that a pattern finds in several groups (`run/*/tactile`), and entries of a stack (`x[*]`),
+        are episodes, see `arraystores`.
     clock: "device", "header", "publish" or "log"; or a field, column or array with times. Without it the first of these
         that runs; see `Report`.
     columns: those of the readings that are taken, by their places from 0, such as "25:44" or "0,3,5:9".
@@ -193,8 +193,8 @@ def _open(path: Path, address: str, request: Request, preset: str | None = None)
     if kind is None:
         what = "a folder that is none of these" if path.is_dir() else repr(path.name)
         raise RecordingError(
-            "expected a recording: .bag, .db3, .mcap, .npy, .npz, .mat, .csv, .parquet, .feather, .h5, .zarr, the "
-            f"folder of a ROS 2 bag with its metadata.yaml, or of a LeRobot data set; came {what} at {address}"
+            "expected a recording: .bag, .db3, .mcap, .npy, .npz, .mat, .csv, .json, .parquet, .feather, .h5, .zarr, "
+            f"the folder of a ROS 2 bag with its metadata.yaml, or of a LeRobot data set; came {what} at {address}"
         )
     if not path.is_dir():
         require_file(path)
@@ -288,9 +288,10 @@ def _recording(block: Block, source: Source, clock: str | None, columns: str | N
 
 
 def _names(source: Source, readings: npt.NDArray[Any]) -> tuple[str, ...]:
-    """The names of a table's columns, as its field lists them; none where there are none, or numbers for them."""
+    """The names of a table's columns, as its field lists them; none where it has none, or the field was requested."""
     names = tuple(name.strip() for name in source.field().split(","))
-    own = not source.topics and readings.ndim == 2 and 1 < len(names) == len(set(names)) == readings.shape[1]
+    own = source.request.field is None and not source.topics and readings.ndim == 2
+    own = own and 1 < len(names) == len(set(names)) == readings.shape[1]
     return names if own and not all(name.isdigit() for name in names) else ()
 
 

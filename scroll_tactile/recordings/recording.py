@@ -163,8 +163,11 @@ class Recording:
     def cure(self, sensor: Sensor) -> str:
         """What to do where these are not the sensor's readings."""
         wider = self.readings.ndim == 2 and self.readings.shape[1] > sensor.channels
-        rising = [bool((np.diff(self.readings[:, i]) > 0).all()) for i in (0, 1)] if wider and len(self) > 1 else []
-        low = int(rising == [True, False])  # as times do, which are no channel
+        low = 0
+        if wider and len(self) > 1:
+            first, second = (np.diff(self.readings[:, i]) for i in (0, 1))
+            if (first >= 0).all() and first.any() and not (second > 0).all():  # as times do, which are no channel
+                low = self.readings.shape[1] - sensor.channels
         some = f" Some of its columns are taken by columns='{low}:{low + sensor.channels}'" if wider else ""
         return f"Is it another sensor's recording, or another field?{some}"
 

@@ -16,14 +16,11 @@ from datetime import UTC, datetime
 from datetime import time as time_of_day
 from pathlib import Path
 
-import numpy as np
-import numpy.typing as npt
-
 from scroll_tactile.errors import RecordingError, ScrollTactileError, printable
 from scroll_tactile.recordings.blocks import Request, Source
 from scroll_tactile.recordings.bounds import require_file
 
-__all__ = ["FEWEST", "LONGEST", "Layout", "Text", "in_seconds", "is_time", "moment", "number", "usual"]
+__all__ = ["FEWEST", "LONGEST", "Layout", "Text", "moment", "number", "usual"]
 
 LONGEST = 1 << 24
 """Characters in a line; a longer one is no table's."""
@@ -47,14 +44,6 @@ _NUMBER = re.compile(
     r"[+-]?(?:\d+(?:\.\d*)?(?:e[+-]?\d+)?|\.\d+(?:e[+-]?\d+)?|inf(?:inity)?|1\.#inf)", re.IGNORECASE | re.ASCII
 )
 _THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(?:,\d{3})+")
-_TIME = re.compile(
-    r"[\W_]*(?:(?:ros|rosbag|bag|unix|log|host|pc|sys(?:tem)?|device|sensor|elapsed|rel(?:ative)?|epoch|header|recv)"
-    r"[ _-]*)?(?:time(?:[ _-]*stamps?)?s?|stamps?|ts?|seconds|n?secs?|nanosec|date(?:[ _]?time)|millis|micros)(?:\(\))?"
-    r"(?:[ _-]+(\w+)|[ _-]*[\[(] ?(\w+) ?[\])])?",
-    re.IGNORECASE,
-)
-_UNIT = re.compile(r"(m|u|µ|μ|n|milli|micro|nano)?s(?:ec(?:ond)?s?)?|(millis|micros)(?:\(\))?", re.IGNORECASE)
-_FACTORS = {"": 1.0, "m": 1e3, "milli": 1e3, "millis": 1e3, "n": 1e9, "nano": 1e9}  # and a million of the others
 
 
 def number(cell: str, decimal: str = ".") -> float | None:
@@ -67,27 +56,6 @@ def number(cell: str, decimal: str = ".") -> float | None:
     if _NUMBER.fullmatch(written):
         return float(written.replace("1.#", ""))
     return math.nan if _MISSING.fullmatch(text) else None
-
-
-def is_time(name: str) -> bool:
-    """Whether a column or key is called as times are: t, timestamp_ns, `Time [ms]`, `__time`, `.header.stamp`."""
-    match = _TIME.fullmatch(re.split("[./]", name.strip())[-1])
-    return match is not None and _unit(match[1] or match[2] or "s") > 0
-
-
-def _unit(text: str) -> float:
-    """How many of a unit of time make a second; 0 for what is none."""
-    match = _UNIT.fullmatch(text.strip("[]() "))
-    return 0.0 if match is None else _FACTORS.get((match[1] or match[2] or "").lower(), 1e6)
-
-
-def in_seconds(times: npt.NDArray[np.float64], name: str, unit: str = "") -> npt.NDArray[np.float64]:
-    """Times in seconds, by the unit in their name or beside it, or by their size where they count from 1970."""
-    name = re.split("[./]", name.strip())[-1]
-    match = _TIME.fullmatch(name)
-    named = _unit((match and (match[1] or match[2])) or unit) or (_unit(name) if name[:2].lower() == "mi" else 0.0)
-    largest = float(np.nanmax(np.abs(times), initial=0.0))
-    return times / (named or next((by for size, by in ((1e17, 1e9), (1e14, 1e6), (1e11, 1e3)) if largest > size), 1.0))
 
 
 def moment(cell: str, decimal: str = ".") -> float | None:

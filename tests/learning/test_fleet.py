@@ -504,7 +504,7 @@ class TestRange:
             assert "as 'a' and not as" in each.why and "low and high" in each.why
 
     def test_it_is_of_the_first_source_and_said_also_after_a_cut(self, tmp_path, beyond, full):
-        paths = touch_files(tmp_path / "sound", TOUCHES[:2])
+        paths = touch_files(tmp_path / "sound", [("sound", touch) for _, touch in TOUCHES[:2]])
         np.save(beyond / "b" / "4.npy", np.linspace(0.2, 9, 120).reshape(60, 2))
         sources = [*paths, beyond / "b" / "4.npy", beyond]
         full(0)

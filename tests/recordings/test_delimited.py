@@ -57,6 +57,7 @@ NAN = float("nan")
         ("ms,N\ntime,a\n500,1\n600,3\n", [[1], [3]], [0.5, 0.6]),
         ("a,b\n[N],[N]\n1,2\n", [[1, 2]], None),
         ("Device: pad\nRate,100\n\ntime,a,b\n0.5,1,2\n0.6,3,4\n", [[1, 2], [3, 4]], [0.5, 0.6]),
+        ("Date\t1\nEnd\nSamples\t150\t150\nEnd\nx\ta\tb\n.5\t1\t2\n1\t3\t5\n", [[0.5, 1, 2], [1, 3, 5]], None),
         ("a,b\n#N/A,2\n-nan(ind),4\n", [[NAN, 2], [NAN, 4]], None),
         ("# made by hand\n1,2\n# a pause\n3,4\n", [[1, 2], [3, 4]], None),
         ('"a\nx",b\n1,2\n', [[1, 2]], None),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from scroll_tactile.errors import FieldError, RecordingError
-from scroll_tactile.recordings import describe, find, iterate, read
+from scroll_tactile.recordings import describe, find, iterate, read, touches
 
 PAD = np.random.default_rng(0).normal(size=(150, 4)).round(3)
 TIMES = np.arange(150) / 50
@@ -72,6 +72,13 @@ def test_json_in_every_form(tmp_path, name, text, options, field, names):
     assert recording.report.rate == pytest.approx(rate) and not recording.report.cut_off
     assert sum(len(block) for block in iterate(tmp_path / name, **options)) == 150
     assert find(tmp_path) == [tmp_path / name]
+
+
+def test_lists_by_name_label_touches_where_that_is_asked_for(tmp_path):
+    (tmp_path / "a.json").write_text(json.dumps({"felt": ROWS[:75], "oak": ROWS[75:]}))
+    recording = read(tmp_path / "a.json")
+    assert [touch.material for touch in touches(recording, "episodes")] == [None, None]
+    assert [touch.material for touch in touches(recording, "episodes", "group:1")] == ["felt", "oak"]
 
 
 def test_what_there_is_is_listed_and_can_be_typed(tmp_path):

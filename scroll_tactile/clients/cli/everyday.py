@@ -474,8 +474,9 @@ class LiveLines:
         """The time and the numbers of a line; None of a header. Raises InputError for other lines."""
         import numpy as np
 
+        from scroll_tactile.recordings.blocks import in_seconds, is_clock
         from scroll_tactile.recordings.recording import places
-        from scroll_tactile.recordings.text import Layout, in_seconds, is_time, moment, number
+        from scroll_tactile.recordings.text import Layout, moment, number
 
         layout = self._layout or Layout.of([line.strip()], self._how.delimiter, self._how.decimal)
         cells = layout.cells(line.strip("\n"))
@@ -486,7 +487,7 @@ class LiveLines:
         values = [number(cell, layout.decimal) for cell in cells]
         fits = len(cells) > self._channels if free else len(cells) in (wide, wide + 1)
         if not self.taken and fits and set(values) == {None}:
-            named = (i for i, name in enumerate(cells) if is_time(name))
+            named = (i for i, name in enumerate(cells) if is_clock(name))
             self._time = next(named, None) if self._time is None else self._time
             self._clock = "" if self._time is None else cells[self._time]
             return None

@@ -54,8 +54,8 @@ StreamFile = Annotated[
 Sources = Annotated[
     list[str],
     Argument(
-        help="Recordings, or folders of them: .npy, .npz, .mat, .csv, .parquet, .bag, .db3, .mcap, .h5, .zarr, LeRobot "
-        "data sets, and addresses such as s3://…",
+        help="Recordings, or folders of them: .npy, .npz, .mat, .csv, .json, .parquet, .bag, .db3, .mcap, .h5, .zarr, "
+        "LeRobot data sets, and addresses such as s3://…",
         show_default=False,
     ),
 ]

@@ -42,7 +42,9 @@ __all__ = [
     "stored_source",
 ]
 
-RECORDINGS = (".bag", ".db3", ".mcap", ".npy", ".npz", ".mat", ".csv", ".h5", ".hdf5", ".parquet", ".feather")
+RECORDINGS = (
+    ".bag", ".db3", ".mcap", ".npy", ".npz", ".mat", ".csv", ".tsv", ".jsonl", ".h5", ".hdf5", ".parquet", ".feather",
+)  # fmt: skip
 PACKED = (".part",)  # what is looked for in a remote folder: the names that packed memories have
 _LOOKED = 3  # sources are looked at for the names of columns
 WHOLE = ("metadata.yaml", "meta/info.json", ".zgroup", "zarr.json")  # in a folder that is one recording
@@ -174,16 +176,20 @@ class SourceOptions:
         of_columns = (Heading.parsed(text).quantity for text in self.annotate)
         return [*self.quantities, *filter(None, of_columns)]
 
+    @property
+    def _where(self) -> dict[str, Any]:
+        names = ("topic", "field", "clock", "definitions", "delimiter", "decimal", "preset", "labels")
+        return {name: getattr(self, name) for name in names}
+
     def by_names(self, sources: Sequence[str], sensor: Sensor) -> SourceOptions:
         """The options with the names of the sensor's columns, or else of those of the first source that can be read."""
         if self.columns is not None or self.names_of or sensor.camera:
             return self
         if sensor.columns:
             return replace(self, names=sensor.columns, names_of=f"sensor {sensor.name!r}")
-        where = {name: getattr(self, name) for name in ("topic", "field", "clock", "preset", "labels")}
         for address in [source for source in sources if not is_memory(source)][:_LOOKED]:
             with suppress(InputError, OSError):
-                names = next(iterate(address, **where)).names
+                names = next(iterate(address, **self._where)).names
                 return replace(self, names=names if len(names) == sensor.channels else (), names_of=address)
         return self
 
@@ -192,20 +198,8 @@ class SourceOptions:
 
         Raises what `recordings.read` raises, and RecordingError for another rate and for other columns.
         """
-        recording = read(
-            address,
-            topic=self.topic,
-            field=self.field,
-            clock=self.clock,
-            columns=self.columns,
-            definitions=self.definitions,
-            delimiter=self.delimiter,
-            decimal=self.decimal,
-            preset=self.preset,
-            rate=sensor.rate,  # where it has no clock
-            labels=self.labels,
-            annotate=self.annotate,
-        )
+        rate = sensor.rate  # where it has no clock
+        recording = read(address, **self._where, columns=self.columns, annotate=self.annotate, rate=rate)
         recording, facts = in_order(recording, self.names, self.names_of)
         for fact in recording.facts(sensor):
             if (fact.kind == "rate" and self.rate is not None) or (fact.argument == "rate" and self.rate == "keep"):

@@ -91,7 +91,7 @@ int tactile_push(tactile_touch *touch, const int16_t *reading);
 /* Judge what was read until now. */
 void tactile_judge(tactile_touch *touch, tactile_answer *answer);
 
-/* The level of a value in the sensor's unit, of a channel that reads from low to high, as Python rounds it: halves to even.
+/* The level of a value in the sensor's unit, of a channel that reads from low to high; halves go to even, as Python's.
  *
  * What lies outside of the range is the nearest within; NaN and infinity are TACTILE_MISSING_LEVEL.
  */

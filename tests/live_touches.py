@@ -40,10 +40,10 @@ def slide(material, count, random):
 
 
 @cache
-def learner(embedding="kernels"):
+def learner(embedding="kernels", repetitions=6):
     made = TactileLearner(sensor=PAD, embedding=EMBEDDINGS[embedding])
     random = np.random.default_rng(1)
-    for _ in range(6):
+    for _ in range(repetitions):
         for material in "abc":
             made.observe(material, slide(material, 50, random))
     made.settle()

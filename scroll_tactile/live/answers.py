@@ -21,14 +21,15 @@ class LiveTouch:
 
     stream: its readings, as a file would hold them, for `learner.observe`. prediction: that of all of it, equal to
     `learner.predict(stream)` of the memory as it was when the touch began. decided: whether it was safe to act on
-    before the touch ended, or is now; False says that it stayed undecided. at: when it began, by the readings' times;
-    without any, in seconds since the session began. end: why it ended: "released", by `end()`, by a "gap" in time,
-    as "time went back", as nothing moved for long ("still"), or because the session was "closed". earlier: the touches
-    of the same thing before it that the prediction weighs with it, as `learner.predict(*earlier, stream)`; none unless
-    `LiveSession.again` said so. revised: the prediction that was decided on before the touch ended, where the whole
-    touch says otherwise; None where it does not. estimates: by quantity, those of all of it, equal to
-    `learner.estimate(stream, risk=…)`; none where no quantity was declared. rest: the half second before it, for
-    `learner.sense`; None where less than that was at rest, of a camera, and where the session is told of contacts.
+    before the touch ended, or is now; False says that it stayed undecided. likely: as of `LiveState`, of all of it. at:
+    when it began, by the readings' times; without any, in seconds since the session began. end: why it ended:
+    "released", by `end()`, by a "gap" in time, as "time went back", as nothing moved for long ("still"), or because the
+    session was "closed". earlier: the touches of the same thing before it that the prediction weighs with it, as
+    `learner.predict(*earlier, stream)`; none unless `LiveSession.again` said so. revised: the prediction that was
+    decided on before the touch ended, where the whole touch says otherwise, or cannot tell; None where it agrees.
+    estimates: by quantity, those of all of it, equal to `learner.estimate(stream, risk=…)`; none where no quantity was
+    declared. rest: the half second before it, for `learner.sense`; None where less than that was at rest, of a camera,
+    and where the session is told of contacts.
     """
 
     stream: Stream
@@ -40,6 +41,7 @@ class LiveTouch:
     revised: Prediction | None = None
     estimates: Mapping[str, Estimate] = field(default_factory=dict)
     rest: Stream | None = None
+    likely: bool = False
 
 
 class LiveState(NamedTuple):
@@ -47,11 +49,13 @@ class LiveState(NamedTuple):
 
     contact: whether something is touched. seconds: since the touch began. prediction: that of the touch's beginning,
     and of the touches of the same thing before it where `LiveSession.again` was called, made at the last of the moments
-    at which it may change; None before the first. decided: whether it is safe to act on: then both stay until the touch
-    ends. ended: whether a touch ended in this push. touches: all that ended in it, in order; a block of readings can
-    hold several. estimates: by quantity, of the last milestone that the touch came to; see
-    `learner.estimate`. settled: whether every interval was as narrow as the session's `widths` ask: a robot need touch
-    no longer for their sake.
+    at which it may change; None before the first. decided: act when decided: it is of a known material, or of something
+    that was never felt (`prediction.known` is True or False); then both stay until the touch ends. likely: whether its
+    probability is enough and it is not called new; where `known` is None it is undecided all the same, for nothing
+    tells whether the material is a learned one. ended: whether a touch ended in this push. touches: all that ended in
+    it, in order; a block of readings can hold several. estimates: by quantity, of the last milestone that the touch
+    came to; see `learner.estimate`. settled: whether every interval was as narrow as the session's `widths` ask: a
+    robot need touch no longer for their sake. age: how many seconds of touch came since the readings of the prediction.
 
     Where a touch ended and none began after it in the same push, all of these but contact and touches are those of the
     touch that ended. At rest they are 0, None, False and empty.
@@ -65,6 +69,8 @@ class LiveState(NamedTuple):
     touches: tuple[LiveTouch, ...] = ()
     estimates: Mapping[str, Estimate] = MappingProxyType({})
     settled: bool = False
+    likely: bool = False
+    age: float = 0.0
 
 
 @dataclass
@@ -74,12 +80,12 @@ class LiveReport:
     readings: that came. ticks: at the sensor's rate, which they became. lost: ticks of which no reading came, filled by
     the line between their neighbours. repeated: readings that came twice, left out. late: that came behind a later one,
     left out. surplus: more than the sensor's rate has room for, left out. untimed: whose stamp stood still, taken as
-    they came. gaps, steps_back: in time; each ends a touch. missing: values that were NaN or infinite.
-    touches: that ended. undecided: of them. revised: of them, decided on before they ended, and whose end says
-    otherwise. truncated: that went on beyond what is kept of a touch. brief: contacts too
-    short for a touch. relearned: how often the sensor turned out to be much quieter than what was learned as its rest:
-    it was touched from the first reading on, and that touch was not found. learning: whether rest is still being
-    learned; nothing is found until then. restless: whether it is not learned yet because what came is no rest.
+    they came. gaps, steps_back: in time; each ends a touch. missing: values that were NaN or infinite. touches: that
+    ended. undecided: of them. revised: of them, decided on before they ended, and whose end says otherwise, or cannot
+    tell. truncated: that went on beyond what is kept of a touch. brief: contacts too short for a touch. relearned: how
+    often the sensor turned out to be much quieter than what was learned as its rest: it was touched from the first
+    reading on, and that touch was not found. learning: whether rest is still being learned; nothing is found until
+    then. restless: whether it is not learned yet because what came is no rest.
     """
 
     readings: int = 0

@@ -1,8 +1,9 @@
 """When a prediction is made within a touch, and when it is safe to act on.
 
-A touch is decided at the first moment at which its prediction is known and its probability is at least `sure`, or at
-which its novelty is at least `least_new`. Held-out touches, run through all rows (see `fitting.rehearse`),
-set both. `least_new` is a novelty that none of them comes near. `sure` is the least probability for which, as for every
+A touch is decided at the first moment at which it is known (`Prediction.known` is True) and its probability is at
+least `sure`, or at which it is called new and its novelty is at least `least_new`. Where nothing can be known, as after
+few touches, none is decided to be of a material. Held-out touches, run through all rows (see `fitting.rehearse`), set
+both. `least_new` is a novelty that none of them comes near. `sure` is the least probability for which, as for every
 higher one, few enough of the n held-out touches are decided wrongly:
 
     (W + M) / 2 n + √(risk (1 − risk) / n) ≤ risk,
@@ -57,15 +58,19 @@ class DecisionRule:
     def decided(self, prediction: Prediction, steps: int, *, several: bool = False) -> bool:
         """Whether it is safe to act on the prediction for the first `steps` of a touch, or for all of it.
 
-        On `prediction.material`, but where it is not known on its being new. several: whether the
-        prediction weighs other touches of the same thing with it.
+        On `prediction.material` where that is known, and on its being new where it is far from all that is. several:
+        whether the prediction weighs other touches of the same thing with it.
         """
-        if steps < self.moments[0]:
+        if prediction.known is False:
+            return steps >= self.moments[0] and prediction.novelty >= self.least_new
+        return prediction.known is True and self.likely(prediction, steps, several=several)
+
+    def likely(self, prediction: Prediction, steps: int, *, several: bool = False) -> bool:
+        """Whether it would be decided to be of `prediction.material` if that were known; not of what is called new."""
+        if prediction.known is False or steps < self.moments[0]:
             return False
-        if prediction.known is not False:
-            sure, whole = self.together if several else self.sure, steps >= self.moments[-1]
-            return prediction.probability >= (min(sure, 1 - self.risk) if whole else sure)
-        return prediction.novelty >= self.least_new
+        sure, whole = self.together if several else self.sure, steps >= self.moments[-1]
+        return prediction.probability >= (min(sure, 1 - self.risk) if whole else sure)
 
 
 def decision_rule(model: Model, risk: float) -> DecisionRule:

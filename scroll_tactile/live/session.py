@@ -104,11 +104,12 @@ class GrowingTouch:
     """The touch under way, and what is predicted of it with the model of the memory as it was when it began.
 
     candidates: the materials that it may be of. rows: its readings, of a camera behind the resting image, and at most
-    `limit` of them; came: how many there were. at: when it began. moments: that are to come, in readings; the next is
-    the last of them. earlier: the touches of the same thing before it; encoded: they, as its model reads them.
-    estimator: None where no quantity was declared. widths: quantity → how narrow its interval is to be. rest: readings
-    before it. correction: through which they are read: that of the memory when the touch began. estimates: by quantity,
-    as of `stage`; settled: whether every interval was as narrow as it is to be, False where none is asked to be.
+    `limit` of them; came: how many there were; told: of them at the prediction. at: when it began. moments: that are to
+    come, in readings; the next is the last of them. earlier: the touches of the same thing before it; encoded: they, as
+    its model reads them. estimator: None where no quantity was declared. widths: quantity → how narrow its interval is
+    to be. rest: readings before it. correction: through which they are read: that of the memory when the touch began.
+    estimates: by quantity, as of `stage`; settled: whether every interval was as narrow as it is to be, False where
+    none is asked to be.
     """
 
     predictor: Predictor
@@ -126,10 +127,12 @@ class GrowingTouch:
     rest: Array | None
     correction: Correction | None
     came: int = 0
+    told: int = 0
     cache: WindowCache = field(default_factory=WindowCache)
     encoded: list[Encoded] = field(default_factory=list)
     prediction: Prediction | None = None
     decided: bool = False
+    likely: bool = False
     estimates: dict[str, Estimate] = field(default_factory=dict)
     stage: int | None = None
     settled: bool = False
@@ -149,6 +152,7 @@ class GrowingTouch:
                 stream = self.beginning(moment)
                 if self.prediction is None or not self.decided:
                     self.predict(stream)
+                    self.told = moment
                 else:  # the prediction stays; what is asked of intervals is not reached yet
                     self._estimate(self._encoded(stream, self.cache), self.prediction)
         if self.decided and (self.settled or not self.widths):
@@ -167,7 +171,9 @@ class GrowingTouch:
         self.encoded = self.encoded or [self._encoded(each, WindowCache()) for each in self.earlier]
         current = self._encoded(stream, self.cache)
         self.prediction = self.predictor.answer_of(self.model, self.candidates, [*self.encoded, current])
-        self.decided |= self.rule.decided(self.prediction, current.steps, several=bool(self.earlier))
+        reached = self.prediction, current.steps
+        self.decided |= self.rule.decided(*reached, several=bool(self.earlier))
+        self.likely = self.rule.likely(*reached, several=bool(self.earlier))
         self._estimate(current, self.prediction)
         return self.prediction
 
@@ -485,6 +491,7 @@ class LiveSession:
             stream=stream,
             prediction=prediction,
             decided=touch.decided,
+            likely=touch.likely,
             at=touch.at,
             end=end,
             earlier=touch.earlier,
@@ -507,29 +514,21 @@ class LiveSession:
 
     def _state(self) -> LiveState:
         touch, ended = self._under_way, tuple(self._ended)
-        if touch is not None:
-            seconds = max(0, touch.came - self._before) / self.sensor.rate
-            return LiveState(
-                contact=True,
-                seconds=seconds,
-                prediction=touch.prediction,
-                decided=touch.decided,
-                ended=bool(ended),
-                touches=ended,
-                estimates=touch.estimates,
-                settled=touch.settled,
-            )
-        if not ended:
+        of = touch or (ended[-1] if ended else None)
+        if of is None:
             return LiveState()
-        last = ended[-1]
+        rate, last = self.sensor.rate, 0.0 if touch else ended[-1].stream.seconds
         return LiveState(
-            seconds=last.stream.seconds,
-            prediction=last.prediction,
-            decided=last.decided,
-            ended=True,
+            contact=touch is not None,
+            seconds=last if touch is None else max(0, touch.came - self._before) / rate,
+            prediction=of.prediction,
+            decided=of.decided,
+            ended=bool(ended),
             touches=ended,
-            estimates=last.estimates,
-            settled=self._settled,
+            estimates=of.estimates,
+            settled=self._settled if touch is None else touch.settled,
+            likely=of.likely,
+            age=0.0 if touch is None or touch.prediction is None else (touch.came - touch.told) / rate,
         )
 
 
@@ -566,9 +565,9 @@ def _checked(predictor: Predictor, widths: Mapping[str, float] | None) -> dict[s
     return requested
 
 
-def _says(prediction: Prediction) -> str | None:
-    """What is acted on: the material, or that it is none that was felt."""
-    return None if prediction.known is False else prediction.material
+def _says(prediction: Prediction) -> str | bool | None:
+    """What is acted on: the material if it is known, False of what was never felt, None where that cannot be told."""
+    return prediction.known and prediction.material
 
 
 _RULES: WeakKeyDictionary[Weighing, dict[float, DecisionRule]] = WeakKeyDictionary()  # by risk

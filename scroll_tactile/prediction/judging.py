@@ -40,7 +40,7 @@ from scroll_tactile.signals.stream import Stream
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import one_thread
 
-__all__ = ["HeldOutTouch", "answer", "estimates_of", "held_out_touches", "judged"]
+__all__ = ["HeldOutTouch", "answer", "estimates_of", "held_out_touches", "judged", "prediction_of"]
 
 FloatArray = npt.NDArray[np.float64]
 Names = Sequence[str]
@@ -76,7 +76,7 @@ def answer(
         probability = model.fitted.dependence.probability([judgement.probability for judgement in judgements])
         novelty = model.fitted.dependence.standard([judgement.novelty for judgement in judgements])
     thresholds = [judgement.row.calibration.thresholds for judgement in judgements]
-    found = _prediction(candidates, probability, novelty, thresholds, false_alarms)
+    found = prediction_of(candidates, probability, novelty, thresholds, false_alarms)
     unusual = {way for judgement in judgements for way in judgement.unusual}
     places = {name: place for place, name in enumerate(candidates)}
     own_share, own_least, all_share, all_least = typical[[places[name] for name, _ in found.ranking]].T.tolist()
@@ -92,7 +92,7 @@ def answer(
     )
 
 
-def _prediction(
+def prediction_of(
     names: Names, probability: FloatArray, novelty: float, thresholds: Sequence[NoveltyThresholds], false_alarms: float
 ) -> Prediction:
     """What is said of touches of one thing. names: in alphabetical order. thresholds: of each touch."""
@@ -274,7 +274,7 @@ def held_out_touches(model: Model, false_alarms: float) -> list[HeldOutTouch]:
             else:
                 result = replace(alone, probability=tempered(chances, row.readout_outliers))
             thresholds = [row.calibration.thresholds]
-            said = _prediction(found.names, result.probability, result.novelty, thresholds, false_alarms)
+            said = prediction_of(found.names, result.probability, result.novelty, thresholds, false_alarms)
             answers[place] = HeldOutTouch(material, key, said)
     return list(answers.values())
 

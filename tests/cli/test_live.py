@@ -156,7 +156,7 @@ def test_lines_have_no_topics_fields_or_clocks(memory, option):
 def test_a_revised_decision_is_called_one(tmp_path):
     random = np.random.default_rng(1)
     with TactileLearner.open(tmp_path / "m", sensor=PAD, embedding=SMALL) as made:
-        for _ in range(6):
+        for _ in range(12):
             for material in "abc":
                 made.observe(material, slide(material, 50, random))
     random = np.random.default_rng(3)

@@ -109,6 +109,8 @@ def test_a_rule_says_known_where_it_is_sure_and_new_where_it_is_strange():
     assert [rule.decided(known[p], 5) for p in known] == [False, False, True]
     assert [rule.decided(known[p], 10) for p in known] == [False, True, True]  # of a whole touch 1 − risk is enough
     assert [rule.decided(new[n], 5) for n in new] == [False, True]
+    untold = Prediction("oak", 0.97, (), 0.0, None, 1.0)
+    assert [rule.decided(untold, 5), rule.likely(untold, 5), rule.likely(new[6.0], 5)] == [False, True, False]
     assert not rule.decided(known[0.97], 4)
     early = DecisionRule((5, 10), 0.05, sure=0.9, together=0.9, least_new=6.0)
     assert [early.decided(known[0.94], columns) for columns in (5, 10)] == [True, True]  # what was decided stays so

@@ -96,7 +96,7 @@ def test_a_touch_tells_the_half_second_at_rest_before_it():
 
 
 def test_decided_never_goes_back_and_what_happens_in_a_block_is_not_lost():
-    made, (rows, _) = learner(), shift("ab", 4)
+    made, (rows, _) = learner(repetitions=12), shift("ab", 4)
     with made.live(risk=0.3) as live:
         decided = False
         for row in rows:
@@ -157,23 +157,62 @@ def test_a_gap_before_the_first_reading_of_a_touch_does_not_end_it():
 
 
 def test_a_decision_that_the_whole_touch_takes_back_is_called_revised():
-    made, random = learner(), np.random.default_rng(3)
+    made, random = learner(repetitions=12), np.random.default_rng(3)
     with made.live(contact="manual", risk=0.3) as live:
         for rest_of_it, revised in (("a", None), ("b", "a")):
             live.begin()
-            now = live.push(slide("a", 20, random))
+            begun = slide("a", 50, random)
+            now = live.push(begun[:20])
             assert now.decided and now.prediction.material == "a"
-            live.push(slide(rest_of_it, 30, random))
+            live.push(begun[20:] if rest_of_it == "a" else slide(rest_of_it, 30, random))
             (touch,) = live.end().touches
             assert touch.prediction.material == rest_of_it
             assert (touch.revised and touch.revised.material) == revised
         assert (live.report.touches, live.report.revised) == (2, 1)
 
 
+def test_a_decision_is_revised_where_the_whole_touch_cannot_tell_any_more():
+    random = np.random.default_rng(2)
+    touch = slide("a", 50, random)
+    touch[20:] = np.clip(touch[20:] + 0.3 * random.standard_normal(touch[20:].shape), 0, 1)
+    with learner(repetitions=7).live(contact="manual", risk=0.3) as live:
+        live.begin()
+        now = live.push(touch[:20])
+        live.push(touch[20:])
+        (ended,) = live.end().touches
+    assert now.decided and now.prediction.known is True
+    assert ended.decided and ended.prediction.known is None and ended.revised == now.prediction
+
+
+def test_an_answer_says_how_old_it_is():
+    with learner().live(contact="manual", risk=1e-12) as live:
+        assert live.push(rest(10, RANDOM)).age == live.begin().age == 0
+        shown, states = [], [live.push(row) for row in slide("a", 60, RANDOM)]
+        assert live.end().age == 0
+    for before, now in zip([None, *states], states, strict=False):
+        fresh = now.prediction is not None and (before is None or now.prediction is not before.prediction)
+        shown += [now.age] if fresh else []
+        assert now.age == (0 if fresh or now.prediction is None else pytest.approx(before.age + 1 / PAD.rate))
+    assert len(shown) > 1
+
+
 def test_what_stays_undecided_says_so():
     with learner().live(contact="manual") as live:
-        assert not touched(live, np.random.default_rng(0).uniform(0, 1, (50, 2))).decided
+        ended = touched(live, np.random.default_rng(0).uniform(0, 1, (50, 2)))
+    assert not ended.decided and not ended.likely
     assert live.report.undecided == 1
+
+
+@pytest.mark.parametrize(("repetitions", "known"), [(6, None), (12, True)])  # 18 touches are one too few to tell
+def test_what_is_likely_is_decided_where_it_can_be_known(repetitions, known):
+    with learner(repetitions=repetitions).live(contact="manual", risk=0.3) as live:
+        live.begin()
+        now = live.push(slide("b", 50, np.random.default_rng(5)))
+        ended = live.end().touches[0]
+    for answer in (now, ended):
+        assert (answer.prediction.material, answer.likely, answer.decided) == ("b", True, known is True)
+    assert now.prediction.known is ended.prediction.known is known
+    assert live.report.undecided == (known is None)
 
 
 def test_frames_without_a_resting_image_need_a_hand_and_of_nothing_observed_nothing_is_known():

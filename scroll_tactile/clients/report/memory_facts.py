@@ -31,7 +31,7 @@ from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.prediction.fitting import rehearse
-from scroll_tactile.prediction.judging import HeldOutTouch, answer, held_out_touches
+from scroll_tactile.prediction.judging import HeldOutTouch, answer, held_out_touches, prediction_of
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.readouts.leave_one_out import rows_at
 from scroll_tactile.readouts.novelty import FEWEST
@@ -227,20 +227,14 @@ def soon(model: Model, extractor: FeatureExtractor, rule: DecisionRule, false_al
     rows, rate = model.weighing.early, extractor.sensor.rate
     done, wrong = np.zeros((2, len(held_out.targets)), bool)
     right, decided, mistaken = [], [], []
+    places = [str(place) for place in range(held_out.chances.shape[2])]
     for i, row in enumerate(rows):
         chances, novelty = held_out.chances[:, i], held_out.novelty[:, i]
         reached = np.isfinite(novelty)
         best = np.where(reached, np.nan_to_num(chances).argmax(axis=1), -1)
         for touch in np.flatnonzero(reached & ~done).tolist():
-            name, chance = str(best[touch]), float(chances[touch].max())
-            prediction = Prediction(
-                material=name,
-                probability=chance,
-                ranking=((name, chance),),
-                novelty=float(novelty[touch]),
-                known=bool(novelty[touch] <= row.calibration.thresholds.above("", false_alarms)),
-                seconds=row.steps / rate,
-            )
+            own = chances[touch], float(novelty[touch]), [row.calibration.thresholds]
+            prediction = prediction_of(places, *own, false_alarms)
             if rule.decided(prediction, row.steps):
                 done[touch], wrong[touch] = True, not prediction.known or best[touch] != held_out.targets[touch]
         right.append(float((best == held_out.targets)[reached].mean()) if reached.any() else 0.0)

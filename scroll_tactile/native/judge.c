@@ -1,5 +1,6 @@
 #include "judge.h"
 
+#include <stddef.h>
 #include <string.h>
 
 enum {
@@ -35,7 +36,7 @@ int tactile_push(tactile_touch *touch, const int16_t *reading)
     if (at >= memory->capacity)
         return 0;
     for (int32_t c = 0; c < memory->channels; c++) {
-        int16_t *own = touch->levels + (size_t)c * memory->capacity + at, level = reading[c];
+        int16_t *own = touch->levels + (ptrdiff_t)c * memory->capacity + at, level = reading[c];
         if (level == TACTILE_MISSING_LEVEL)
             level = at ? own[-1] : 0;
         if (level > TACTILE_LEVELS || level < -TACTILE_LEVELS) {
@@ -121,7 +122,7 @@ static int32_t segment_of(const tactile_touch *touch, int32_t count, int32_t edg
 static void weigh(tactile_touch *touch, int32_t k, int32_t feature, int32_t sum)
 {
     const int32_t materials = touch->memory->materials;
-    const int16_t *weights = touch->memory->scales[k].weights + (size_t)feature * materials;
+    const int16_t *weights = touch->memory->scales[k].weights + (ptrdiff_t)feature * materials;
     int64_t *sums = touch->sums[k];
     for (int32_t m = 0; m < materials; m++)
         sums[m] += (int64_t)weights[m] * sum;
@@ -201,7 +202,7 @@ static void weigh_triangles(tactile_touch *touch, int32_t k, int32_t begin)
     memset(touch->triangles, 0, (size_t)scale->triangles * sizeof *touch->triangles);
     for (int32_t w = 0; scale->triangles && w < touch->windows[k]; w++) {
         for (int32_t c = 0; c < memory->channels; c++)
-            measure(touch->levels + (size_t)c * memory->capacity + touch->starts[k][w], reach(touch, scale),
+            measure(touch->levels + (ptrdiff_t)c * memory->capacity + touch->starts[k][w], reach(touch, scale),
                     touch->statistics + c, memory->channels);
         for (int32_t i = 0; i < scale->triangles; i++) {
             uint32_t turned = scale->phases[i]; /* modulo 2^23, so modulo 2^32 is enough */
@@ -231,7 +232,7 @@ static int64_t settle(tactile_touch *touch, int32_t k)
     for (int32_t m = 0; m < materials; m++) {
         int64_t u = 0;
         for (int32_t other = 0; other < materials; other++)
-            u += scale->background[(size_t)m * materials + other] * z[other];
+            u += scale->background[(ptrdiff_t)m * materials + other] * z[other];
         whole += within(shifted(u, scale->background_shift), MOST_U_BITS) * z[m];
     }
     return within(shifted(whole, 16) - 2 * best, MOST_DISTANCE_BITS);

@@ -78,6 +78,10 @@ typedef struct {
     int64_t sums[TACTILE_MOST_SCALES][TACTILE_MOST_MATERIALS];
 } tactile_touch;
 
+#ifdef __cplusplus
+extern "C" {
+#endif
+
 /* Forget the touch before. */
 void tactile_begin(tactile_touch *touch);
 
@@ -86,5 +90,24 @@ int tactile_push(tactile_touch *touch, const int16_t *reading);
 
 /* Judge what was read until now. */
 void tactile_judge(tactile_touch *touch, tactile_answer *answer);
+
+/* The level of a value in the sensor's unit, of a channel that reads from low to high; halves go to even, as Python's.
+ *
+ * What lies outside of the range is the nearest within; NaN and infinity are TACTILE_MISSING_LEVEL.
+ */
+static inline int16_t tactile_level(float low, float high, float value)
+{
+    if (!(value - value == 0))
+        return TACTILE_MISSING_LEVEL;
+    const float half = (high - low) / 2, inside = value < low ? low : value > high ? high : value;
+    const float image = (inside - low) / half - 1, steps = image * (float)TACTILE_LEVELS;
+    const int32_t whole = (int32_t)steps, odd = whole % 2 != 0;
+    const float rest = steps - (float)whole;
+    return (int16_t)(whole + (rest > 0.5f || (rest == 0.5f && odd)) - (rest < -0.5f || (rest == -0.5f && odd)));
+}
+
+#ifdef __cplusplus
+}
+#endif
 
 #endif

@@ -1,5 +1,6 @@
 #include "kernels.h"
 
+#include <stddef.h>
 #include <string.h>
 
 #include "wide.h"
@@ -8,18 +9,18 @@
 WIDE static void sum_channels(const int16_t *restrict levels, int32_t stride, int32_t readings,
                               const uint16_t *restrict channels, int32_t count, int32_t *restrict sums)
 {
-    const int16_t *one = levels + (size_t)channels[0] * stride;
+    const int16_t *one = levels + (ptrdiff_t)channels[0] * stride;
     int32_t i = 1;
     for (int32_t t = 0; t < readings; t++)
         sums[t] = one[t];
     for (; i + 3 < count; i += 4) {
-        const int16_t *a = levels + (size_t)channels[i] * stride, *b = levels + (size_t)channels[i + 1] * stride;
-        const int16_t *c = levels + (size_t)channels[i + 2] * stride, *d = levels + (size_t)channels[i + 3] * stride;
+        const int16_t *a = levels + (ptrdiff_t)channels[i] * stride, *b = levels + (ptrdiff_t)channels[i + 1] * stride;
+        const int16_t *c = levels + (ptrdiff_t)channels[i + 2] * stride, *d = levels + (ptrdiff_t)channels[i + 3] * stride;
         for (int32_t t = 0; t < readings; t++)
             sums[t] += (int32_t)a[t] + b[t] + c[t] + d[t];
     }
     for (; i < count; i++) {
-        one = levels + (size_t)channels[i] * stride;
+        one = levels + (ptrdiff_t)channels[i] * stride;
         for (int32_t t = 0; t < readings; t++)
             sums[t] += one[t];
     }
@@ -60,7 +61,7 @@ WIDE static void extremes(const int32_t *restrict responses, int32_t readings, i
     memset(most, 0, (size_t)places * sizeof *most);
     memset(least, 0, (size_t)places * sizeof *least);
     for (int32_t member = 0; member < TACTILE_GROUP; member++) {
-        const int32_t *own = responses + (size_t)member * readings, weight = weights[member];
+        const int32_t *own = responses + (ptrdiff_t)member * readings, weight = weights[member];
         for (int32_t t = 0; t < places; t++) {
             const int32_t value = own[t] * weight;
             most[t] = value > most[t] ? value : most[t];
@@ -102,7 +103,7 @@ typedef struct {
 /* The responses of a kernel, in one of the places that a group's have; made unless they are there. */
 static const int32_t *responses_of(state *at, int32_t kernel, int32_t slot)
 {
-    int32_t *responses = at->responses + (size_t)slot * at->readings;
+    int32_t *responses = at->responses + (ptrdiff_t)slot * at->readings;
     if (at->held[slot] != kernel) {
         tactile_respond(at->bank, kernel, at->levels, at->readings, at->readings, at->work, responses);
         at->held[slot] = kernel;
@@ -116,7 +117,7 @@ static void count_features(const tactile_bank *bank, const tactile_request *requ
     for (int32_t feature = kernel; feature < request->features; feature += bank->kernels) {
         tactile_exceeding(responses, bank->thresholds[feature], request->edges, request->segments, before);
         for (int32_t w = 0; w < request->windows; w++)
-            counted[(size_t)w * request->features + feature] =
+            counted[(ptrdiff_t)w * request->features + feature] =
                 before[request->spans[2 * w + 1]] - before[request->spans[2 * w]];
     }
 }
@@ -131,7 +132,7 @@ static void compete(state *at, const tactile_request *request, int32_t group, in
         responses_of(at, members[i], i);
     extremes(at->responses, at->readings, places, weights, most, least);
     for (int32_t i = 0; i < TACTILE_GROUP; i++) {
-        const int32_t *own = at->responses + (size_t)i * at->readings, place = TACTILE_GROUP * group + i;
+        const int32_t *own = at->responses + (ptrdiff_t)i * at->readings, place = TACTILE_GROUP * group + i;
         contests[place] = winning(own, weights[i], most, places);
         contests[TACTILE_GROUP * request->groups + place] = winning(own, weights[i], least, places);
     }

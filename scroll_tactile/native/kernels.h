@@ -46,6 +46,10 @@ typedef struct {
 /* How many int32_t `tactile_count` needs to work in. */
 #define TACTILE_WORK(readings, segments) ((TACTILE_GROUP + 3) * (readings) + (segments) + 1)
 
+#ifdef __cplusplus
+extern "C" {
+#endif
+
 /* A kernel's responses: `readings` − TACTILE_SPAN · dilation of them, in as many places as there are readings.
  *
  * levels: of each channel `stride` readings, of which the first `readings` count. work: (3, readings).
@@ -64,5 +68,9 @@ void tactile_exceeding(const int32_t *values, int32_t threshold, const int32_t *
  */
 void tactile_count(const tactile_bank *bank, const int16_t *levels, int32_t readings, const tactile_request *request,
                    int32_t *counted, int32_t *contests, int32_t *work);
+
+#ifdef __cplusplus
+}
+#endif
 
 #endif

@@ -10,4 +10,8 @@
 #define WIDE
 #endif
 
+#ifdef __cplusplus
+#define restrict __restrict
+#endif
+
 #endif

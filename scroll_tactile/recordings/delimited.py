@@ -228,7 +228,11 @@ class Delimited(Text):
             self.begin += 1
         data = [cells for row, _, cells in rows if row >= self.begin and self.width <= len(cells) <= self.width + 1]
         named = [cells for cells in above if self.width <= len(cells) <= self.width + 1]
-        if header is None and not named and data and self._counts(data):
+        if (
+            header is None
+            and not named
+            and self._counts([[c for c, own in zip(r, numeric, strict=False) if own] for r in data])
+        ):
             named, self.begin = [data.pop(0)], self.begin + 1
         units = next((cells for cells in named if len(named) > 1 and _are_units(cells)), None)
         names = next((cells for cells in reversed(named) if cells is not units), None)
@@ -275,7 +279,9 @@ class Delimited(Text):
         return text > 0 and (text >= len(numbers) or numbers == [str(i) for i in range(len(numbers))])
 
     def _counts(self, data: list[list[str]]) -> bool:
-        """Whether the first row counts 0, 1, 2 …: one or two cells may be a reading that looks as those below."""
+        """Whether the first of rows of numbers counts 0, 1, 2 …: one or two may be a reading like those below."""
+        if not any(data[:1]):
+            return False
         numbers = [cell.strip() for cell in data[0] if cell.strip()]
         counted = bool(numbers) and numbers == [str(i) for i in range(len(numbers))]
         unlike = not data[0][0].strip() or any("." in cell for cell in (data[1] if len(data) > 1 else []))

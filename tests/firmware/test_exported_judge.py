@@ -2,6 +2,7 @@
 
 import shutil
 import subprocess
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -21,7 +22,8 @@ needs_compiler = pytest.mark.skipif(COMPILER is None, reason="there is no C comp
 SANITIZED = ("-std=c99", "-O1", "-Wall", "-Wextra", "-Werror", "-fsanitize=address,undefined", "-fno-sanitize-recover")
 NAMES = ['"quoted"\\', "*/ oak /*", "naïve 0??/", "plain"]
 SHORT = Sensor(name="short", channels=1, rate=100.0, low=0.0, high=1.0, unit="1", duration=0.4)  # one width of windows
-PAD = Sensor(name="pad", channels=3, rate=100.0, low=-1.0, high=2.0, unit="N", duration=1.0)
+RANGES = {"low": (-1.0, 0.1, 1e-30), "high": (2.0, 1e30, 3e-30)}
+PAD = Sensor(name="pad", channels=3, rate=99.9, **RANGES, unit="N", duration=1.0)
 KINDS = {"short": SHORT, "pad": PAD, "roboskin": sensors.ROBOSKIN}
 
 
@@ -98,14 +100,60 @@ def test_a_touch_that_is_longer_than_the_memory_is_judged_by_what_fits(exports):
     assert differing(folder, touches_to_check(judge, [longer])) == (1, 0)
 
 
-@needs_compiler
-def test_names_of_anything_are_strings_in_c(exports):
-    folder, judge, scene, _ = exports["pad"]
-    touches = [judge.levels(scene.touch(name, 60)) for name in scene.materials[:4]]
-    (folder / "touches.bin").write_bytes(touches_to_check(judge, touches))
-    said = subprocess.run([folder / "example"], cwd=folder, capture_output=True, check=True).stdout.decode()
-    assert [judge.answer(touch).material for touch in touches] == NAMES
-    assert all(f"{name}, " in said for name in NAMES)
+STRICT = ("-O2", "-Wall", "-Wextra", "-Wconversion", "-Werror")
+CALLER = """#include <stdio.h>
+#include "touch_memory.h"
+int main(void)
+{
+    float values[TOUCH_MEMORY_CHANNELS];
+    tactile_answer answer;
+    touch_memory_begin();
+    while (fread(values, sizeof values, 1, stdin) == 1) {
+        int16_t levels[TOUCH_MEMORY_CHANNELS];
+        for (int c = 0; c < TOUCH_MEMORY_CHANNELS; c++)
+            levels[c] = touch_memory_level(c, values[c]);
+        fwrite(levels, sizeof levels, 1, stdout);
+        touch_memory_push(levels);
+    }
+    touch_memory_answer(&answer);
+    fwrite(&answer.novelty, sizeof answer.novelty, 1, stdout);
+    fwrite(answer.scores, sizeof *answer.scores, TOUCH_MEMORY_MATERIALS, stdout);
+    printf("%s %g %d ", TOUCH_MEMORY_DIGEST, TOUCH_MEMORY_RATE, (int)answer.material);
+    fwrite(TOUCH_MEMORY_SENSOR, sizeof TOUCH_MEMORY_SENSOR, 1, stdout);
+    for (int m = 0; m < TOUCH_MEMORY_MATERIALS; m++)
+        puts(touch_memory_names[m]);
+}
+"""
+ODD = ('"quoted"\\', "*/ int x; /*", "naïve 0??/\n#error\\\r", "\u202e％d%s" + 3000 * "Ω")
+C99, CPP = ("gcc", "-x", "c", "-std=c99"), ("g++", "-x", "c++", "-std=c++17")
+CLANG, PP = ("clang", *C99[1:]), ("clang++", *CPP[1:])
+WAYS = {"c": (C99, C99), "c from c++": (C99, CPP), "c++": (CPP, CPP), "clang": (CLANG, CLANG), "clang++": (CLANG, PP)}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_c_and_cpp_take_values_in_the_sensors_unit_as_python_and_names_of_anything(exports, tmp_path, way):
+    if any(shutil.which(compiler) is None for compiler, *_ in WAYS[way]):
+        pytest.skip(f"{way} is not there")
+    _, whole, scene, learner = exports["pad"]
+    judge = replace(whole, materials=ODD, sensor=whole.sensor.model_copy(update={"name": "\0".join(ODD)}))
+    low, high = judge.sensor.limits
+    random, ties = np.random.default_rng(0).random((2, 4000, 3))
+    span, ties = high - low, np.rint(4096 * ties) / 4096 + 1 / 8192
+    values = [scene.touch(scene.materials[0], 9).readings, low + span * ties, low + span * (1.2 * random - 0.1)]
+    values = np.concatenate([*values, [low, high]]).astype(np.float32)
+    levels = replace(judge, capacity=len(values)).levels(values)
+    answer, lost = judge.answer(levels), np.array([[np.nan, np.inf, -np.inf]], np.float32)
+    write_firmware(judge, tmp_path, [])
+    (tmp_path / "caller.c").write_text(CALLER)
+    for name in ("main", "touch_memory", "judge", "kernels", "caller"):
+        subprocess.run([*WAYS[way][name == "caller"], *STRICT, "-c", f"{name}.c"], cwd=tmp_path, check=True)
+    objects = ["touch_memory.o", "judge.o", "kernels.o", "caller.o"]
+    subprocess.run([WAYS[way][1][0], *objects, "-o", "caller"], cwd=tmp_path, check=True)
+    given = values.tobytes() + lost.tobytes()
+    came = subprocess.run([tmp_path / "caller"], input=given, capture_output=True, check=True).stdout
+    expected = [np.append(levels, np.full(3, MISSING_LEVEL, np.int16)), np.array([answer.novelty, *answer.scores])]
+    said = f"{learner.digest()} 99.9 {ODD.index(answer.material)} {judge.sensor.name}\0" + "\n".join((*ODD, ""))
+    assert came == b"".join(part.tobytes() for part in expected) + said.encode()
 
 
 @pytest.mark.parametrize("kind", ["pad", "roboskin"])
@@ -172,10 +220,21 @@ def test_what_cannot_be_exported_is_refused(tmp_path, exports):
             judge.answer(levels)
 
 
-def test_windows_that_a_chip_cannot_weigh_exactly_are_refused():
-    fast = Sensor(name="fast", channels=1, rate=62_000.0, low=0.0, high=1.0, unit="1", duration=1.0)
-    with pytest.raises(InputError, match=r"at most 46340 readings, .*; fast has 46500"):
-        TactileLearner(sensor=fast, embedding=Kernels(dimension=64)).exported()
+@pytest.mark.parametrize(
+    ("fields", "longest", "said", "argument"),
+    [
+        ({"rate": 62e3}, 0, r"46340 readings in a window.*has 46500\. Learn one reading in 2,.* rate=", "rate"),
+        ({"channels": 2**14 + 1}, 0, r"16384 channels.*has 16385\. Learn fewer", "channels"),
+        ({"channels": 60}, 2**26, r"35791394 readings in a touch.*has 67108864\. Learn touches cut", None),
+        ({}, 2**29, r"536870911 readings in a touch.*has 536870912", None),
+    ],
+)
+def test_what_a_chips_numbers_do_not_hold_is_refused(monkeypatch, fields, longest, said, argument):
+    learner = TactileLearner(sensor=Sensor(**{**vars(SHORT), "duration": 1.0, **fields}), embedding=Kernels())
+    monkeypatch.setattr(type(learner.memory.statistics), "longest", longest)
+    with pytest.raises(InputError, match=said) as refusal:
+        learner.exported()
+    assert refusal.value.argument == argument
 
 
 def test_too_many_materials_are_refused():

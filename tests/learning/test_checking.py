@@ -65,10 +65,10 @@ def test_a_check_that_dies_is_damage(path, tmp_path, monkeypatch, death):
     statement, said = DEATHS[death]
     (tmp_path / "sitecustomize.py").write_text(
         "import scroll_tactile_store.survey\n"
-        "def problems(self):\n"
+        "def leftovers(self):\n"
         "    self.progress('rows', 1, 3)\n"
         f"    {statement}\n"
-        "scroll_tactile_store.survey.Survey.problems = problems\n"
+        "scroll_tactile_store.survey.Survey.leftovers = leftovers\n"
     )
     monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
     if death == "a hang":  # the others end by themselves, however long a busy machine takes to start them

@@ -29,7 +29,7 @@ def written(folder, asked, heading=HEADING, force="{}"):
         readings = touch.readings if way(name, i) == "forth" else touch.readings[::-1]
         files.append(folder / f"{name}-{i}.npy")
         np.save(files[-1], readings)
-        rows.append(f"{name}-{i}.npy,0,9,{name},{force.format(value)},{way(name, i)}")
+        rows.append(f"{name}-{i}.npy,0,{len(readings) / touch.sensor.rate},{name},{force.format(value)},{way(name, i)}")
     (folder / "table.csv").write_text("\n".join(rows))
     return ["--labels", folder / "table.csv"], files
 

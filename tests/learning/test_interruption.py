@@ -103,12 +103,18 @@ def state(learner):
 
 def without_a_path(touches):
     learner = TactileLearner(sensor=PAD, embedding=SMALL, exemplars=2, kept_touches=4)
-    learner.memory.sample = SmallSample(4)
     for touch in touches:
         learner.observe(*touch)
     return learner
 
 
+@pytest.fixture
+def soon_full(monkeypatch):
+    """Also of a memory that is read again after an interrupt."""
+    monkeypatch.setattr("scroll_tactile.memory.state.TouchSample", SmallSample)
+
+
+@pytest.mark.usefixtures("soon_full")
 class TestWithoutAPath:
     """An interrupt at any line leaves it before or after the change, and what comes then is as if it never was."""
 

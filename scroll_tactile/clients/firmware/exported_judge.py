@@ -117,11 +117,12 @@ class ExportedAnswer:
 class ExportedJudge:
     """The reduced judge of a scene: made by `TactileLearner.exported`, written as C by `write_firmware`.
 
-    materials: of the scene, in alphabetical order. capacity: readings that a touch can have, those of the longest that
-    was learned; later ones are not read. scales, stages: ascending.
+    digest: of the memory. materials: of the scene, in alphabetical order. capacity: readings that a touch can have,
+    those of the longest that was learned; later ones are not read. scales, stages: ascending.
     """
 
     sensor: Sensor
+    digest: str
     embedding: Kernels
     plan: WindowPlan
     materials: tuple[str, ...]
@@ -155,7 +156,7 @@ class ExportedJudge:
         steps = taken.shape[1]
         reached = [stage for stage in self.stages if stage.least <= steps]
         if not reached:
-            return ExportedAnswer(material=None, known=None, probability=0.0, scores=(), novelty=0, readings=steps)
+            return ExportedAnswer(None, None, 0.0, (), 0, readings=steps)
         stage = reached[-1]
         novelty, scores = -stage.threshold, np.zeros(len(self.materials), np.int64)
         among = self.scales[: len(stage.weights)]
@@ -167,14 +168,7 @@ class ExportedJudge:
         total = int(CHANCES[behind[behind < MOST_CHANCES]].sum(dtype=np.int64))
         probability = 65535 * int(CHANCES[0]) // total / 65535
         known, best = False if novelty > 0 else True if stage.detects else None, self.materials[scores.argmax()]
-        return ExportedAnswer(
-            material=best,
-            known=known,
-            probability=probability,
-            scores=tuple(scores.tolist()),
-            novelty=novelty,
-            readings=steps,
-        )
+        return ExportedAnswer(best, known, probability, tuple(scores.tolist()), novelty, readings=steps)
 
     def _sums(self, levels: npt.NDArray[np.float32], among: Sequence[ExportedScale]) -> list[tuple[Integers, int]]:
         """For each scale the weighed sums of its features over its windows, (M,), and how many windows these are."""
@@ -207,8 +201,6 @@ def _angled(counts: npt.NDArray[np.integer], places: int) -> Integers:
 def _repeated(levels: LevelRows) -> LevelRows:
     """Levels (T, n) with a channel's last one where nothing was read, 0 where there is none before."""
     missing = levels == MISSING_LEVEL
-    if not missing.any():
-        return levels
     last = np.maximum.accumulate(np.where(missing, -1, np.arange(len(levels))[:, None]), axis=0)
     filled = np.take_along_axis(levels, last.clip(0), axis=0)
     return np.where(last < 0, np.int16(0), filled).astype(np.int16)

@@ -44,42 +44,52 @@ MOST_SHIFT = 62
 MOST_THRESHOLD = 2**61
 MOST_SCALES = 2  # as judge.h has it
 MOST_WIDTH = 46_340  # readings: the sums of a wider window's squares are no exact float64, and overflow in judge.c
+MOST_CHANNELS = 2**14  # four statistics of each are numbered in 16 bits
+MOST_VALUES = 2**31 - 1  # of a touch, or of what it is judged in: int32 counts them
 LEAST_BITS = -SCORE_BITS  # of a score: at 2⁸ logits a unit, materials lie so far apart that nothing can be told
 
 
 def exported_judge(recipe: Recipe, memory: Memory, scene: Sequence[str] | None) -> ExportedJudge:
     """The exported judge of a scene, by a memory as it is now; see `TactileLearner.exported`."""
     names = candidates_of(scene, sorted(memory.statistics.materials), memory.statistics.materials.keys())
-    _require_exportable(recipe, names)
+    _require_exportable(recipe, names, memory.statistics.longest)
     embedding = recipe.embedding
     assert isinstance(embedding, Kernels)
     with one_thread():
         readouts = _readouts(memory, names)
         stages = _calibrations(memory, readouts)
-    scales = [_Quantised(readout) for readout in readouts]
+    scales, bits = zip(*map(_quantised, readouts), strict=True)
     return ExportedJudge(
         sensor=recipe.sensor,
+        digest=memory.digest(),
         embedding=embedding,
         plan=recipe.plan,
         materials=tuple(names),
         capacity=memory.statistics.longest,
-        scales=tuple(scale.exported() for scale in scales),
+        scales=scales,
         stages=tuple(
-            _stage(least, calibration, scales, recipe.settings.false_alarms, several=len(names) > 1)
+            _stage(least, calibration, bits, recipe.settings.false_alarms, several=len(names) > 1)
             for least, calibration in stages
         ),
     )
 
 
-def _require_exportable(recipe: Recipe, names: Sequence[str]) -> None:
+def _require_exportable(recipe: Recipe, names: Sequence[str], longest: int) -> None:
     if not isinstance(recipe.embedding, Kernels) or recipe.sensor.camera or len(recipe.plan.widths) > MOST_SCALES:
         raise InputError(
             f"only memories of the default embedding, Kernels, can be exported as C; this one's is "
             f"{recipe.embedding!r} for {recipe.sensor.name}. Carry it over with reembed(Kernels())"
         )
-    if max(recipe.plan.widths) > MOST_WIDTH:
-        came = f"{recipe.sensor.name} has {max(recipe.plan.widths)}"
-        raise InputError(f"expected windows of at most {MOST_WIDTH} readings, which a chip weighs exactly; {came}")
+    sensor, width = recipe.sensor, max(recipe.plan.widths)
+    slower = f"Learn one reading in {-(-width // MOST_WIDTH)}, of a sensor with a lower rate="
+    for what, came, most, cure, argument in (
+        ("readings in a window", width, MOST_WIDTH, slower, "rate"),
+        ("channels", sensor.channels, MOST_CHANNELS, "Learn fewer channels=, or means of neighbours", "channels"),
+        ("readings in a touch", longest, MOST_VALUES // max(4, sensor.channels), "Learn touches cut shorter", None),
+    ):
+        if came > most:
+            beyond = f"expected at most {most} {what}, which a chip's whole numbers hold; {sensor.name} has {came}"
+            raise InputError(f"{beyond}. {cure}", argument=argument)
     if not 0 < len(names) <= MOST_MATERIALS:
         raise InputError(
             f"expected a scene of 1 to {MOST_MATERIALS} materials; came {len(names)}. Name those that can be there"
@@ -111,58 +121,46 @@ def _calibrations(memory: Memory, readouts: Sequence[Readout]) -> list[tuple[int
     return found
 
 
-class _Quantised:
-    """A readout of one width in whole numbers.
-
-    bits: of a score's fraction, at most SCORE_BITS: a unit is 2^-bits logits.
-    """
-
-    def __init__(self, readout: Readout) -> None:
-        self._readout = readout
-        derived = readout.derived()
-        # z about the mean of the scene's materials, for features in 0 … 1.
-        self._weights = derived.weights * 2.0**BITS
-        self._offsets = -(derived.weights @ (readout.origin + derived.middle))
-        largest = float(np.abs(self._weights).max())
-        self._unit = 30 if largest == 0 else min(30, math.floor(math.log2((ONE - 1) / largest)))
-        self.bits = min(SCORE_BITS, self._unit + 15)
-        if self.bits < LEAST_BITS:
-            raise InputError(
-                f"materials whose touches are all alike cannot be weighed in 16 bits: a feature of "
-                f"{readout.scale.width} readings weighs {largest:.0e} logits. Observe touches that differ as those to "
-                "come will"
-            )
-
-    def exported(self) -> ExportedScale:
-        derived, width = self._readout.derived(), self._readout.scale.width
-        top = float(np.abs(derived.background).max())
-        # u in 2⁻¹⁶: H counts in 2^-shift of a unit of scores.
-        fine = FACTOR_BITS - (math.frexp(top)[1] if top else 0)
-        shift = fine + self.bits - SPREAD_BITS
-        fine, shift = fine - max(0, shift - MOST_SHIFT), min(shift, MOST_SHIFT)
-        return ExportedScale(
-            scale=Scale("window", width),
-            weights=np.rint(self._weights.T * 2.0**self._unit).astype(np.int16),
-            shift=15 + self._unit - self.bits,
-            offsets=np.rint(self._offsets * 2.0**self.bits).astype(np.int64),
-            halves=np.rint(np.diagonal(derived.gram) / 2 * 2.0**self.bits).astype(np.int64),
-            background=np.rint(derived.background * 2.0**fine).astype(np.int32),
-            background_shift=shift,
+def _quantised(readout: Readout) -> tuple[ExportedScale, int]:
+    """A readout of one width in whole numbers, and the bits of a score's fraction: a unit is 2^-bits logits."""
+    derived, width = readout.derived(), readout.scale.width
+    # z about the mean of the scene's materials, for features in 0 … 1.
+    weights = derived.weights * 2.0**BITS
+    offsets = -(derived.weights @ (readout.origin + derived.middle))
+    largest, top = float(np.abs(weights).max()), float(np.abs(derived.background).max())
+    unit = 30 if largest == 0 else min(30, math.floor(math.log2((ONE - 1) / largest)))
+    bits = min(SCORE_BITS, unit + 15)
+    if bits < LEAST_BITS:
+        raise InputError(
+            f"materials whose touches are all alike cannot be weighed in 16 bits: a feature of {width} readings weighs "
+            f"{largest:.0e} logits. Observe touches that differ as those to come will"
         )
+    # u in 2⁻¹⁶: H counts in 2^-shift of a unit of scores.
+    fine = FACTOR_BITS - (math.frexp(top)[1] if top else 0)
+    shift = fine + bits - SPREAD_BITS
+    fine, shift = fine - max(0, shift - MOST_SHIFT), min(shift, MOST_SHIFT)
+    made = ExportedScale(
+        scale=Scale("window", width),
+        weights=np.rint(weights.T * 2.0**unit).astype(np.int16),
+        shift=15 + unit - bits,
+        offsets=np.rint(offsets * 2.0**bits).astype(np.int64),
+        halves=np.rint(np.diagonal(derived.gram) / 2 * 2.0**bits).astype(np.int64),
+        background=np.rint(derived.background * 2.0**fine).astype(np.int32),
+        background_shift=shift,
+    )
+    return made, bits
 
 
 def _stage(
-    least: int, calibration: Calibration, scales: Sequence[_Quantised], false_alarms: float, *, several: bool
+    least: int, calibration: Calibration, bits: Sequence[int], false_alarms: float, *, several: bool
 ) -> ExportedStage:
-    among = scales[: len(calibration.weights)]
     mean, spread = calibration.scale_novelty.T
     weights = [
-        min(round(float(weight) * 2.0 ** (LOGIT_BITS - scale.bits)), 2**31 - 1)
-        for weight, scale in zip(calibration.weights, among, strict=True)
+        min(round(float(weight) * 2.0 ** (LOGIT_BITS - own)), 2**31 - 1)
+        for weight, own in zip(calibration.weights, bits, strict=False)
     ]
     factors = [
-        _factor(2.0 ** (SPREAD_BITS - scale.bits) / (float(one) * len(among)))
-        for one, scale in zip(spread, among, strict=True)
+        _factor(2.0 ** (SPREAD_BITS - own) / (float(one) * len(spread))) for one, own in zip(spread, bits, strict=False)
     ]
     threshold = 2.0**SPREAD_BITS * (calibration.thresholds.above("", false_alarms) + float((mean / spread).mean()))
     return ExportedStage(

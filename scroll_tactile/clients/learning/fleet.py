@@ -113,8 +113,7 @@ def learn(
     learned again. A worker that dies is tried once more, source by source. Sources that cannot be read, and those whose
     worker died twice, are listed in the report; all others are learned.
     Warns at the end by a FactWarning of each kind of fact, see `FleetReport`; the touches are learned all the same.
-    Tables with names of columns are read by these, as the sensor has them or the first source, and a new memory's
-    sensor keeps them.
+    Tables go by the names of their columns, the sensor's or the first source's; a new memory's sensor keeps them.
 
     Raises InputError without a sensor for a new memory, and for several workers where the memory was adapted to a
     changed skin; MismatchError for a memory of another sensor; AnnotationError where it has a quantity with another
@@ -144,10 +143,9 @@ def learn(
                 run.learn_here(found)
             else:
                 run.learn_apart(found, workers or os.cpu_count() or 1, executor)
-        names = list(learner.materials)
-        for name in sorted(report.learned.keys() - run.before.keys()):
-            names.remove(name)  # it stands beside those before, and those that are still to be looked at
-            report.facts = merged([*report.facts, *name_fact(name, names)])
+        new = sorted(report.learned.keys() - run.before.keys())  # each stands beside those before, and those behind it
+        near = [fact for i, name in enumerate(new) for fact in name_fact(name, [*run.before, *new[i + 1 :]])]
+        report.facts = merged([*report.facts, *near])
         if report.held:
             report.digest = learner.digest()
             with suppress(ScrollTactileError):  # the touches are learned: who opens the memory is told
@@ -255,7 +253,7 @@ class _Run:
             if memory:
                 self._merge_memory(*sources)
             else:
-                self._note(learn_sources(self._learner, sources, self._options, self._learning))
+                self._note(learn_sources(self._learner, sources, self._options, self._show))
             self._came_in(len(sources))
 
     def learn_apart(self, found: Sequence[str], workers: int, executor: Executor | None) -> None:
@@ -366,9 +364,8 @@ class _Run:
     def _merge(self, path: Path, clipped: Collection[bytes] = (), source: str = "") -> None:
         """Merge a memory, each touch once. clipped: as of `Learned`. source: of touches that have none."""
         how: Any = {"choice": self._descriptions, "one_name": True, "clipped": clipped, "source": source or None}
-        merged, refused = self._learner._ledger.merge(
-            path, lambda what, done, of: self._show(f"{what} {done} of {of} touches"), **how
-        )
+        how["progress"] = lambda what, done, of: self._show(f"{what} {done} of {of} touches")
+        merged, refused = self._learner._ledger.merge(path, **how)
         self._report.repeated += merged.shared
         self._report.refused += [Refused(str(head.attributes.get("source", source)), why) for head, why in refused]
 
@@ -384,10 +381,7 @@ class _Run:
         rate = report.observations / (time.perf_counter() - self._begun)
         self._show(f"{report.observations} touches, {rate:.0f} a second, {len(report.refused)} refused")
 
-    def _learning(self, what: str, done: int, of: int) -> None:
-        self._show(what, done)
-
-    def _show(self, what: str, more: int = 0) -> None:
+    def _show(self, what: str, more: int = 0, _: int = 0) -> None:
         self._progress(what, self._done + more, self._report.sources)
 
 

@@ -87,7 +87,7 @@ __all__ = [
     "write_firmware",
 ]
 
-__version__ = "0.19.0"
+__version__ = "0.20.0"
 
 # Imported on first use: a sensor's name should not wait for the libraries behind a learner.
 _MODULES = {

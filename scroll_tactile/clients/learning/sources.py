@@ -165,8 +165,7 @@ class SourceOptions:
             names = list(dict.fromkeys(folders[level - 1] for folders in found if len(folders) >= level))
             levels.append(f"by='folder:{level}' for {', '.join(names[:3])}{' …' if len(names) > 3 else ''}")
         raise InputError(
-            f"by='folder' would take a folder for a material that is none: {why}. Say which folder names the material: "
-            f"{'; '.join(levels)}",
+            f"expected folders named by material; {why}. Say which of them name it: {'; '.join(levels)}",
             argument="by",
         )
 

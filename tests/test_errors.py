@@ -51,7 +51,7 @@ def test_messages_read_as_written_and_survive_pickling(error):
 OF_DAMAGE = {"path": Path("log"), "sequence": 7, "offset": 4096, "frame": 3}
 
 
-@pytest.mark.parametrize("error", [getattr(exceptions, name) for name in exceptions.__all__ if name.endswith("Error")])
+@pytest.mark.parametrize("error", [each for name, each in vars(exceptions).items() if name.endswith("Error")])
 def test_an_error_of_the_store_comes_whole_from_another_process(error):
     fields = OF_DAMAGE if error is exceptions.DamageError else {}
     again = pickle.loads(pickle.dumps(error("row 7 is damaged", **fields)))

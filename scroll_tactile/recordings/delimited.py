@@ -228,11 +228,9 @@ class Delimited(Text):
             self.begin += 1
         data = [cells for row, _, cells in rows if row >= self.begin and self.width <= len(cells) <= self.width + 1]
         named = [cells for cells in above if self.width <= len(cells) <= self.width + 1]
-        if (
-            header is None
-            and not named
-            and self._counts([[c for c, own in zip(r, numeric, strict=False) if own] for r in data])
-        ):
+        others = len(above) - len(named)
+        numbers = [[cell for cell, own in zip(cells, numeric, strict=False) if own] for cells in data]
+        if header is None and not named and self._counts(numbers):
             named, self.begin = [data.pop(0)], self.begin + 1
         units = next((cells for cells in named if len(named) > 1 and _are_units(cells)), None)
         names = next((cells for cells in reversed(named) if cells is not units), None)
@@ -240,7 +238,7 @@ class Delimited(Text):
         self.units = (units or [""] * self.width)[: self.width]
         self.columns = [self.named(name) for name in (names or map(str, range(self.width)))][: self.width]
         self.columns[0] = self.columns[0].lstrip("#% ")
-        if others := len(above) - len(named):
+        if others:
             self.notes.append(f"{others} rows above the numbers name no column")
         self._assign(data, numeric)
 

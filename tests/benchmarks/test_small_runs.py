@@ -89,7 +89,7 @@ def test_each_way_of_appending_keeps_the_rows(tmp_path, monkeypatch):
         kept = [data for (data,) in database.execute("SELECT bytes FROM row ORDER BY sequence")]
     with Log(tmp_path / "log") as log:
         rows = [log.read(frame.offset, frame.size) for batch in log.scan(refuse) for frame in batch]
-    assert kept == rows and [decode_row(row).head.sequence for row in rows] == list(range(1, 16))
+    assert kept == rows and [decode_row(row)[0].sequence for row in rows] == list(range(1, 16))
     assert (tmp_path / "bare").stat().st_size == 15 * appending.ROW_BYTES
 
 

@@ -109,7 +109,7 @@ class TestLearn:
     def test_a_cut_that_is_none_and_a_memory_that_is_being_written_are_refused(self, memory: Path, data: Path) -> None:
         assert run("learn", memory, data, "--cut", "thin").exit_code == 2
         with TactileLearner.open(memory):
-            assert "is being written by process" in refused("learn", memory, data, "--label", "a")
+            assert "is being written by this process" in refused("learn", memory, data, "--label", "a")
 
     def test_labels_in_a_table(self, memory: Path, data: Path, tmp_path: Path) -> None:
         rows = SCENE.touch("silk", 0).readings
@@ -157,8 +157,8 @@ class TestPredict:
         np.save(tmp_path / "t.npy", readings)
         header = ",".join(map(str, range(60)))
         np.savetxt(tmp_path / "t.csv", readings, delimiter=",", header=header, comments="", fmt="%.9g")
-        from_table = json.loads(run("predict", learned, tmp_path / "t.csv", "--json").stdout)
-        assert from_table == json.loads(run("predict", learned, tmp_path / "t.npy", "--json").stdout)
+        told = [json.loads(run("predict", learned, tmp_path / name, "--json").stdout) for name in ("t.csv", "t.npy")]
+        assert told[0] == told[1]
         assert run("observe", learned, "wool", tmp_path / "t.csv").exit_code == 0
         found = json.loads(run("learn", learned, tmp_path / "t.npy", "--label", "wool", "--json").stdout)
         assert (found["touches"], found["skipped"]) == (0, 1)

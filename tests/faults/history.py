@@ -64,7 +64,8 @@ def learn_files(path: Path, state: State, touches: Pairs) -> int:
         destination = Path(home, "m")
         path.rename(destination)  # with what the run keeps beside it
         made = {"embedding": KIT.embeddings[state.embedding], "executor": Here()}
-        done = learn(files, destination, SourceOptions(by="folder"), **made)
+        by = f"folder:{len(destination.parts)}"  # of files that are typed the whole path counts
+        done = learn(files, destination, SourceOptions(by=by), **made)
         assert not done.refused, done.refused
         destination.rename(path)
         return done.observations

@@ -175,8 +175,8 @@ def test_a_compaction_checkpoint_behind_it_has_it(path: Path) -> None:
             learner.observe(NAMES[0], other(touch(NAMES[0], 80 + i)))
         learner.compact(keep=1)
         kept, store = correction(learner), learner._ledger.store
-        assert store is not None and store.newest is not None
-        newest, learner._ledger.saves = store.newest, False
+        assert store is not None and store.state().newest is not None
+        newest, learner._ledger.saves = store.state().newest, False
     spoil(path, newest)
     with TactileLearner.open(path) as learner:
         assert learner.memory.checkpoint != newest and correction(learner) == kept

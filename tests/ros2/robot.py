@@ -51,7 +51,7 @@ def taught(path, sensor, embedding):
     """A memory on disk of three materials."""
     random = np.random.default_rng(1)
     with TactileLearner.open(path, sensor=sensor, embedding=embedding) as learner, learner.batch():
-        for _ in range(6):
+        for _ in range(12):
             for material in "abc":
                 learner.observe(material, slide(material, 50, random))
     return path

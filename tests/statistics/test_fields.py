@@ -87,7 +87,7 @@ def test_an_array_that_is_another_is_named_with_what_was_expected_and_what_came(
     [
         ({"inner": None}, "inner: expected a mapping; came None"),
         ({"inner": {"names": "ab"}}, "inner-names.*valid list"),
-        ({"inner": {"names": ["a", "\n"]}}, "inner-names.1: .*printable"),
+        ({"inner": {"names": ["a", "b\n."]}}, "inner-names.1: .*printable"),
         ({"several": {}}, "several: expected a list"),
         ({"several": [3]}, "several-0: expected a mapping; came 3"),
         ({"told": {"x": "y"}}, "told.x: .*valid integer"),

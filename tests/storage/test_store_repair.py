@@ -66,7 +66,7 @@ def test_a_sound_store_is_left_as_it_is(either):
 
 def give_up(path, number):
     """A row without its arrays, as compaction leaves it."""
-    change_rows(path, lambda found: found.update({number: head_without_arrays(decode_row(found[number]).head)}))
+    change_rows(path, lambda found: found.update({number: head_without_arrays(decode_row(found[number])[0])}))
 
 
 def forge_arrays(path, number):

@@ -255,7 +255,7 @@ def test_what_was_learned_last_is_taken_back_first_once_and_not_after_somebody_e
     own.retract(numbers[2])
     for name, number in (("felt", numbers[1]), ("wool", numbers[0])):
         assert made.undo().startswith(f"{name}: observation {number} was taken back")
-    assert made.learned is None and own.materials == {"a": 6, "b": 6, "c": 6}
+    assert made.learned is None and own.materials == {"a": 12, "b": 12, "c": 12}
     with pytest.raises(errors.InputError, match="there is none"):
         made.undo()
 

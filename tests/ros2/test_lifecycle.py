@@ -135,7 +135,7 @@ def test_readings_that_come_while_the_memory_opens_are_all_taken_and_what_was_ac
         output = ended_by_ctrl_c(process)
     assert "own: 3 materials" in output
     with TactileLearner.open(own, mode="read") as kept:
-        assert kept.digest() != digest and kept.materials == {"a": 6, "b": 6, "c": 6}
+        assert kept.digest() != digest and kept.materials == {"a": 12, "b": 12, "c": 12}
 
 
 @pytest.fixture

@@ -73,9 +73,9 @@ class ZarrBuffer(ArraySource):
                     continue
                 if codecs is not None:
                     how: dict[str, Any] = {"path": key, "mode": "r", "zarr_format": 3 if last == "zarr.json" else 2}
-                    array = zarr.open_array(store, **how)
-                    size = math.prod(array.chunks) * array.dtype.itemsize
-                    arrays[key or "data"] = zarr.open_array(_checked(store, sizes, codecs, size, self.address), **how)
+                    checked = _checked(store, sizes, codecs, self.address)
+                    array = arrays[key or "data"] = zarr.open_array(checked, **how)
+                    checked.chunk = math.prod(array.chunks) * array.dtype.itemsize
             yield arrays
 
 
@@ -109,17 +109,20 @@ def _sizes(folder: Path) -> dict[str, int]:
     return found
 
 
-def _checked(store: Any, sizes: dict[str, int], codecs: list[str], size: int, address: str) -> Any:
-    """The store, of which no chunk becomes more than `size` bytes."""
+def _checked(store: Any, sizes: dict[str, int], codecs: list[str], address: str) -> Any:
+    """The store, of which no chunk becomes more bytes than its `chunk` says, which an array's description tells."""
     from zarr.storage import WrapperStore
 
     class Checked(WrapperStore[Any]):
+        chunk = 0
+
         async def get(self, key: str, prototype: Any, byte_range: Any = None) -> Any:
-            if sizes.get(key, 0) > 2 * size + _DESCRIPTION:
-                raise RecordingError(f"{key} of {address} has {sizes[key]} bytes for a chunk of {size}: is it whole?")
+            if sizes.get(key, 0) > 2 * self.chunk + _DESCRIPTION:
+                what = f"{key} of {address} has {sizes[key]} bytes for a chunk of {self.chunk}"
+                raise RecordingError(f"{what}: is it whole?")
             found = await store.get(key, prototype, byte_range)
             if found is not None and not key.endswith((".zarray", ".zattrs", "zarr.json")):
-                _require_chunk(found.to_bytes(), codecs, size, f"chunk {key} of {address}")
+                _require_chunk(found.to_bytes(), codecs, self.chunk, f"chunk {key} of {address}")
             return found
 
     return Checked(store)

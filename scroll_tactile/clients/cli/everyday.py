@@ -121,12 +121,13 @@ def observe(
     except ValueError as error:
         raise InputError(f"expected --value as a name and a number, such as force=1.4: {error}") from None
     options, chosen = how.taken(cut="none", material=material), sensor_for(memory, sensor, how.preset)
+    touch = None
     if chosen is not None and not memory.exists():
         options = options.by_names([str(file)], chosen)
         chosen = chosen.model_copy(update={"columns": tuple(options.names) or None})
-        _one_touch(TactileLearner(sensor=chosen), str(file), options)  # what is refused makes no memory
+        touch = _one_touch(TactileLearner(sensor=chosen), str(file), options)  # what is refused makes no memory
     with opened(memory, sensor=chosen, new=True) as learner:
-        touch = _one_touch(learner, str(file), options.by_names([], learner.sensor))
+        touch = touch or _one_touch(learner, str(file), options.by_names([], learner.sensor))
         say_facts([fact for fact in touch.facts if fact.kind not in OF_TOUCHES])  # of the others observe warns
         source = stored_source(str(file))
         receipt = learner.observe(material, touch.stream, values=values, labels=labels, source=source)

@@ -23,12 +23,9 @@ from scroll_tactile.recordings.recording import Episode, Gap, Recording, Report,
 __all__ = ["describe", "find", "iterate", "read"]
 
 _DEEPEST = 64  # folders within each other in which recordings are looked for
-_FAST, _BATCH, _LATE = (
-    0.002,
-    5,
-    0.95,
-)  # messages come in batches where the median step is below so many seconds, and the
-# latest twentieth of all steps are so many times as long: the pauses between batches are no gaps
+# Messages come in batches where the median step is below so many seconds, and the latest twentieth of all steps are so
+# many times as long: the pauses between batches are no gaps.
+_FAST, _BATCH, _LATE = 0.002, 5, 0.95
 
 _Address = str | PathLike[str]
 _Definitions = Mapping[str, str] | str | PathLike[str] | None

@@ -67,10 +67,9 @@ class Touch:
 
 
 Cut = Literal["whole", "episodes"] | Sequence[Interval] | Callable[[Recording], Iterable[tuple[int, int]]]
-Label = str | None
 
 
-def touches(recording: Recording, cut: Cut = "whole", label: Label = None) -> tuple[Touch, ...]:
+def touches(recording: Recording, cut: Cut = "whole", label: str | None = None) -> tuple[Touch, ...]:
     """The touches in a recording.
 
     cut: "whole" (all readings are one touch), "episodes", a table's intervals (those of this file), or a function that
@@ -115,7 +114,7 @@ def touches(recording: Recording, cut: Cut = "whole", label: Label = None) -> tu
     )
 
 
-def _label(recording: Recording, span: Episode, label: Label) -> str | None:
+def _label(recording: Recording, span: Episode, label: str | None) -> str | None:
     place = _place(recording.source)
     if label is None:
         return span.name

@@ -106,11 +106,6 @@ class Statistics(Algebra):
         return {name: own.touches for name, own in sorted(self._own.items())}
 
     @property
-    def material_count(self) -> int:
-        """How many materials have observations; `materials` sorts their names."""
-        return len(self._own)
-
-    @property
     def touches(self) -> int:
         """The number of observations."""
         return self._lengths.total()

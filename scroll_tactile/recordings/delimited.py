@@ -15,7 +15,7 @@ import numpy.typing as npt
 from scroll_tactile.errors import FieldError, RecordingError, ScrollTactileError
 from scroll_tactile.recordings.blocks import Block, Contents, Entry, Request, in_seconds, is_clock, rows_of
 from scroll_tactile.recordings.paths import nearest
-from scroll_tactile.recordings.text import FEWEST, LONGEST, Layout, Text, moment, number, usual
+from scroll_tactile.recordings.text import FEWEST, LONGEST, Layout, Text, modal_length, moment, number
 
 __all__ = ["LONGEST", "SUFFIXES", "Delimited"]
 
@@ -57,7 +57,7 @@ class Delimited(Text):
         lines = [line for _, line in head if not line.startswith(("#", "%"))] or [line for _, line in head]
         self.layout = Layout.of(lines[-_SAMPLE:], delimiter, request.decimal)
         rows = [(row, line, self.layout.cells(line)) for row, line in head]
-        self.width = usual([self.layout.cells(line) for line in lines])
+        self.width = modal_length([self.layout.cells(line) for line in lines])
         if self.width > _MOST_COLUMNS:
             raise RecordingError(f"{address} has {self.width} columns; expected at most {_MOST_COLUMNS}")
         self.episode, self.said = 0, ""
@@ -246,7 +246,9 @@ class Delimited(Text):
         """Which columns are times, labels and readings, by the first rows of numbers; others are left out."""
         own, self.looked = data[:-1] if self.unended else data, len(data)
         last = [cells[self.width - 1].strip() for cells in own] if len(own) > FEWEST else [""]
-        self.tail = usual([cell.partition(self.layout.decimal)[2] for cell in last])  # decimals of the last column
+        self.tail = modal_length(
+            [cell.partition(self.layout.decimal)[2] for cell in last]
+        )  # decimals of the last column
         self.time = None if self.request.clock is None else self._column(self.request.clock)
         apart = []
         for i, name in enumerate(self.columns if self.header else []):

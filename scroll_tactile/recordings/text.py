@@ -20,7 +20,7 @@ from scroll_tactile.errors import RecordingError, ScrollTactileError, printable
 from scroll_tactile.recordings.blocks import Request, Source
 from scroll_tactile.recordings.bounds import require_file
 
-__all__ = ["FEWEST", "LONGEST", "Layout", "Text", "moment", "number", "usual"]
+__all__ = ["FEWEST", "LONGEST", "Layout", "Text", "modal_length", "moment", "number"]
 
 LONGEST = 1 << 24
 """Characters in a line; a longer one is no table's."""
@@ -97,7 +97,7 @@ class Layout:
                 continue
             layout = cls(mark, point)
             rows = [layout.cells(line) for line in lines]
-            width = usual(rows)
+            width = modal_length(rows)
             own = [row[:64] for row in rows if len(row) == width]
             numbers = sum(number(cell, point) is not None for row in own for cell in row)
             score = (numbers / max(sum(map(len, own)), 1) + 1e-3 * (width > 1)) * len(own)
@@ -122,7 +122,7 @@ class Layout:
             return [line]
 
 
-def usual(rows: Sequence[Sequence[str]]) -> int:
+def modal_length(rows: Sequence[Sequence[str]]) -> int:
     """The number of cells that most rows have, the larger one of two."""
     counts = Counter(map(len, rows))
     return max(counts, key=lambda width: (counts[width], width), default=0)

@@ -29,10 +29,10 @@ __all__ = [
     "Rule",
     "all_clipped",
     "channels_named",
+    "fact_warnings",
     "judged",
     "merged",
     "name_fact",
-    "told",
     "touch_facts",
     "warn_of",
 ]
@@ -197,7 +197,7 @@ def warn_of(fact: Fact, stacklevel: int = 2) -> None:
 
 
 @contextmanager
-def told() -> Iterator[list[str]]:
+def fact_warnings() -> Iterator[list[str]]:
     """Gather what is warned of facts in the block, as sentences, in place of showing it."""
     found: list[str] = []
     with warnings.catch_warnings(record=True) as caught:

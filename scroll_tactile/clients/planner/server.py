@@ -24,7 +24,7 @@ from scroll_tactile.learner import TactileLearner
 from scroll_tactile.libraries import optional
 from scroll_tactile.recordings import read
 from scroll_tactile.sensors import Sensor
-from scroll_tactile.signals.facts import told
+from scroll_tactile.signals.facts import fact_warnings
 from scroll_tactile.signals.stream import Stream
 
 __all__ = ["serve"]
@@ -142,7 +142,7 @@ class _Tools:
         scene: list[Material] | None = None,
     ) -> dict[str, Any]:
         """Say of which material a touch is. scene: the materials that can be there; without it all that are known."""
-        with told() as facts:
+        with fact_warnings() as facts:
             touch = self.learner.stream(self.served.touch(self.learner.sensor, readings, file, topic, field, columns))
         facts += map(str, self.learner._facts_of(touch))
         answer = self.learner.predict(touch, scene=scene)
@@ -192,7 +192,7 @@ class _Tools:
         columns: Columns = None,
     ) -> dict[str, Any]:
         """Learn that a touch is of this material, durably. Of what it had already nothing is learned twice."""
-        with told() as facts:
+        with fact_warnings() as facts:
             touch = self.learner.stream(self.served.touch(self.learner.sensor, readings, file, topic, field, columns))
             receipt = self.learner.observe(material, touch, source=file)
         found = {"observation": receipt.sequence, "material": receipt.material, "repeated": receipt.repeated}

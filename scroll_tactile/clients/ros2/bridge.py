@@ -21,7 +21,7 @@ from scroll_tactile.recordings.reader import reported
 from scroll_tactile.recordings.rosbag import picture
 from scroll_tactile.results import Estimate, Prediction, Receipt
 from scroll_tactile.settings import candidates_of
-from scroll_tactile.signals.facts import all_clipped, told
+from scroll_tactile.signals.facts import all_clipped, fact_warnings
 from scroll_tactile.signals.stream import Stream
 
 __all__ = ["Answer", "Bridge", "BridgeReport"]
@@ -257,7 +257,7 @@ class Bridge:
         touch = self._ended_touch("to learn")
         if (why := refusal(self.learner.names_of(touch), material, all_clipped(touch))) is not None:
             raise InputError(f"{why}, or touch it again")
-        with told() as facts:
+        with fact_warnings() as facts:
             receipt = self.receipt = self.learner.observe(material, touch)
         for fact in facts:
             self._warn(f"{receipt.material}: {fact}")

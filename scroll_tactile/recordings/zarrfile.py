@@ -66,8 +66,7 @@ class ZarrBuffer(ArraySource):
                 if last not in _DESCRIPTIONS[:2]:
                     continue
                 try:
-                    told = (self.path / name).read_bytes() if folder else file.read(name)
-                    codecs = _codecs(json.loads(told))
+                    codecs = _codecs(json.loads((self.path / name).read_bytes() if folder else file.read(name)))
                 except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
                     self.unread.append(f"{key or 'the array'}: {error!s:.200}")
                     continue

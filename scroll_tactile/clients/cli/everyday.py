@@ -129,8 +129,7 @@ def observe(
     with opened(memory, sensor=chosen, new=True) as learner:
         touch = touch or _one_touch(learner, str(file), options.by_names([], learner.sensor))
         say_facts([fact for fact in touch.facts if fact.kind not in OF_TOUCHES])  # of the others observe warns
-        source = stored_source(str(file))
-        receipt = learner.observe(material, touch.stream, values=values, labels=labels, source=source)
+        receipt = learner.observe(material, touch.stream, values=values, labels=labels, source=stored_source(str(file)))
         count = learner.materials[material]
     clipped = f", {receipt.clipped} values outside the sensor's range clipped" if receipt.clipped else ""
     done = f"{receipt.seconds:g} s kept as observation {receipt.sequence}{clipped}"

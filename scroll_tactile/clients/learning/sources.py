@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import pairwise
+from itertools import islice, pairwise
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal, Self
 
@@ -133,7 +133,7 @@ class SourceOptions:
         Raises InputError for an interval whose file is none of the sources, or several, and for by="folder" where
         folders name no materials: they are numbers alone, or one name lies in several folders.
         """
-        files = [source for source in sources if not is_memory(source)]
+        files = [each for each in sources if (self.intervals or self.by == "folder") and not is_memory(each)]
         require_found(self.intervals or (), files)
         placed = replace(self, tops=tuple(paths))
         if self.by == "folder":
@@ -186,7 +186,7 @@ class SourceOptions:
             return self
         if sensor.columns:
             return replace(self, names=sensor.columns, names_of=f"sensor {sensor.name!r}")
-        for address in [source for source in sources if not is_memory(source)][:_LOOKED]:
+        for address in islice((source for source in sources if not is_memory(source)), _LOOKED):
             with suppress(InputError, OSError):
                 names = next(iterate(address, **self._where)).names
                 return replace(self, names=names if len(names) == sensor.channels else (), names_of=address)
